@@ -23,7 +23,7 @@ import numpy as np
 
 from bodyslam_jax import sfm
 from bodyslam_jax.config import Structure
-from bodyslam_jax.sfm.camera_model import DECISIVE
+from bodyslam_jax.sfm.camera_model import DECISIVE_LOG_ODDS
 from bodyslam_jax.types import Sequence
 
 CLEAR = {"aspect": np.log(1.3), "radial": 0.15, "zoom": np.log(1.3)}
@@ -135,7 +135,7 @@ def models_at(row: dict, factor: float) -> tuple[str, ...]:
 
     def is_decisive(model: tuple[str, ...]) -> bool:
         simpler = [odds[other] for other in odds if set(other) < set(model)]
-        return all(odds[model] - value > DECISIVE for value in simpler)
+        return all(odds[model] - value > DECISIVE_LOG_ODDS for value in simpler)
 
     decisive = [model for model in odds if model and is_decisive(model)]
     return max(decisive, key=lambda model: odds[model], default=())

@@ -11,8 +11,8 @@ from test_frontend_motion import CAMERA, path, scene
 from bodyslam_jax.config import Structure
 from bodyslam_jax.sfm import find_camera_model
 from bodyslam_jax.sfm.bundle import Scene, Views
-from bodyslam_jax.sfm.camera_model import DECISIVE, is_decisive, prior_of
-from bodyslam_jax.sfm.lens import OTHER_FOCAL, Lens, examine_lens
+from bodyslam_jax.sfm.camera_model import DECISIVE_LOG_ODDS, is_decisive, prior_of
+from bodyslam_jax.sfm.lens import OTHER_FOCAL_MODEL, Lens, examine_lens
 from bodyslam_jax.sfm.sfm import Reconstruction
 from bodyslam_jax.sfm.upright_people import plausibility
 from bodyslam_jax.types import Keypoints, Tracks
@@ -101,7 +101,7 @@ def test_an_ordinary_film_keeps_its_camera_at_ten_times_the_odds(kind):
     lenses = examined(kind, 1)
     assert len(lenses) >= 4
     for lens in lenses[1:]:
-        assert lens.log_odds + len(lens.model) * np.log(10) < DECISIVE
+        assert lens.log_odds + len(lens.model) * np.log(10) < DECISIVE_LOG_ODDS
 
 
 def zoomed(uv, frame):
@@ -119,7 +119,7 @@ def test_a_clear_deviation_is_decisive_at_a_tenth_of_the_odds(model, bend):
     lenses = examined("orbit", 2, bend=bend)
     best = max(lenses[1:], key=lambda lens: lens.log_odds)
     assert model in best.model
-    assert best.log_odds - len(best.model) * np.log(10) > DECISIVE
+    assert best.log_odds - len(best.model) * np.log(10) > DECISIVE_LOG_ODDS
 
 
 def test_a_distorted_lens_is_decisive_and_its_standard_deviation_holds():
@@ -129,7 +129,7 @@ def test_a_distorted_lens_is_decisive_and_its_standard_deviation_holds():
 
     lenses = examined("orbit", 3, bend=bend)
     best = max(lenses[1:], key=lambda lens: lens.log_odds)
-    assert "radial" in best.model and best.log_odds > DECISIVE
+    assert "radial" in best.model and best.log_odds > DECISIVE_LOG_ODDS
     assert abs(best.radial + 0.2) < 4 * best.radial_sigma < 0.1
 
 
@@ -144,7 +144,7 @@ def test_a_rolling_shutter_is_no_stretched_video():
         return uv + np.stack([0 * shift, shift], axis=-1)
 
     lenses = examined("sideways", 4, bend=bend)
-    assert all(lens.log_odds < DECISIVE for lens in lenses[1:])
+    assert all(lens.log_odds < DECISIVE_LOG_ODDS for lens in lenses[1:])
 
 
 def test_a_deviation_must_beat_all_simpler_cameras_and_not_itself():
@@ -153,7 +153,7 @@ def test_a_deviation_must_beat_all_simpler_cameras_and_not_itself():
     lens = lambda odds, *model: Lens(
         model, 0.0, odds, **numbers | {"zoom": np.zeros(3)}
     )
-    ordinary, other = lens(0.0), lens(20.0, *OTHER_FOCAL)
+    ordinary, other = lens(0.0), lens(20.0, *OTHER_FOCAL_MODEL)
     aspect, radial, both = (
         lens(9.0, "aspect"),
         lens(18.0, "radial"),

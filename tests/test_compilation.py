@@ -29,7 +29,7 @@ def test_a_program_compiled_with_options_gives_the_same():
 def test_options_that_xla_does_not_know_are_left_out(monkeypatch):
     for known in ({"xla_llvm_disable_expensive_passes": True}, {}):
         options = {"no_such_option": True, **known}
-        monkeypatch.setattr(compilation, "_OPTIONS", options)
+        monkeypatch.setattr(compilation, "_XLA_CPU_OPTIONS", options)
         compilation.quick_options.cache_clear()
         assert compilation.quick_options() == (known or None)
     monkeypatch.undo()

@@ -16,10 +16,10 @@ from bodyslam_jax.sfm import incremental, reconstruct, track
 from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
 from bodyslam_jax.sfm.features import match, spread
 from bodyslam_jax.sfm.incremental import Builder, build_map
-from bodyslam_jax.sfm.missing_poses import fill_missing_poses
 from bodyslam_jax.sfm.multiview import resect
 from bodyslam_jax.sfm.partial_map import PartialMap
 from bodyslam_jax.sfm.person_mask import person_masks
+from bodyslam_jax.sfm.sfm import fill_missing_poses
 from bodyslam_jax.simulation import as_sequence, simulate
 from bodyslam_jax.types import Intrinsics, Keypoints, Sequence, Tracks
 
@@ -310,7 +310,7 @@ def test_a_camera_that_turns_on_where_it_hardly_moves_is_located(monkeypatch):
     found = reconstruct(tracks, CAMERA, 60)
     assert found.registered.all()
     assert camera_error(found.T_WC, truth) < 0.05
-    monkeypatch.setattr(incremental, "_RELAXED", 0)
+    monkeypatch.setattr(incremental, "_NUM_RELAXED_ROUNDS", 0)
     assert not reconstruct(tracks, CAMERA, 60).registered.all()
 
 
@@ -476,8 +476,8 @@ def test_a_thin_place_is_crossed_from_the_side_that_explains_more(monkeypatch):
     tracks = Tracks(tracks.frame[now] - first, landmark, tracks.uv[now])
     truth = simulated.T_WC[first : first + num]
     away = []
-    for thin in (incremental.FEW_POINTS, 0):
-        monkeypatch.setattr(incremental, "FEW_POINTS", thin)
+    for thin in (incremental.MIN_RELIABLE_POINTS, 0):
+        monkeypatch.setattr(incremental, "MIN_RELIABLE_POINTS", thin)
         config = Structure(join_tracks=False)
         found = reconstruct(tracks, sequence.intrinsics, num, config)
         assert found.registered.all()

@@ -241,7 +241,7 @@ def test_memory_of_long_tracks_is_counted_in_every_chunk(monkeypatch):
         """What the factorisation keeps, and what is counted for those that go last."""
         longest = lambda span, *_: np.argsort(-span, kind="stable")[:far]
         monkeypatch.setattr("bodyslam_jax.graph.layout.choose_long_tracks", longest)
-        monkeypatch.setattr("bodyslam_jax.graph.layout._SIZE", FAR)
+        monkeypatch.setattr("bodyslam_jax.graph.layout._GROUP_LANDMARKS", FAR)
         monkeypatch.setattr("bodyslam_jax.graph.sizes.SIZES", ())
         problem, _, state = problems.make(frames=43, people=0, landmarks=60, far=far)
         assert problem.layout.lasting == far
@@ -264,7 +264,7 @@ def test_memory_of_long_tracks_is_counted_in_every_chunk(monkeypatch):
 def test_memory_limits_of_containers_are_read(monkeypatch, tmp_path):
     limit, other = tmp_path / "memory.max", tmp_path / "none"
     limit.write_text("1048576\n")
-    monkeypatch.setattr(memory, "_LIMITS", (str(other), str(limit)))
+    monkeypatch.setattr(memory, "_CGROUP_LIMIT_FILES", (str(other), str(limit)))
     assert memory.memory() == 2**20
     limit.write_text("max\n")
     assert memory.memory() > 2**28

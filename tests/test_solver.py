@@ -29,7 +29,7 @@ from bodyslam_jax.solver import (
 from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.blocks import sizes_of
 from bodyslam_jax.solver.compilation import quick_options
-from bodyslam_jax.solver.gmres import RESTART, gmres
+from bodyslam_jax.solver.gmres import MAX_DIRECTIONS, gmres
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.padding import pad
@@ -65,7 +65,7 @@ def last(monkeypatch, count):
     own_sizes(monkeypatch)
     longest = lambda span, *_: np.argsort(-span, kind="stable")[:count]
     monkeypatch.setattr("bodyslam_jax.graph.layout.choose_long_tracks", longest)
-    monkeypatch.setattr("bodyslam_jax.graph.layout._SIZE", count // 2)
+    monkeypatch.setattr("bodyslam_jax.graph.layout._GROUP_LANDMARKS", count // 2)
 
 
 @pytest.mark.parametrize(
@@ -566,7 +566,7 @@ def test_steps_and_covariances_do_not_depend_on_how_chunks_stand(monkeypatch):
     in_time, state, _ = make(9, frames=63, people=2, landmarks=80)
     assert in_time.layout.order is None
     order = np.array([3, 0, 5, 1, 6, 2, 4])
-    monkeypatch.setattr("bodyslam_jax.graph.ordering._GAIN", np.inf)
+    monkeypatch.setattr("bodyslam_jax.graph.ordering._MAX_COST_RATIO", np.inf)
     monkeypatch.setattr("bodyslam_jax.graph.ordering._spectral", lambda *_: order)
     problem = g.make_problem(in_time.factors, state)
     assert problem.layout.order.tolist() == order.tolist()
@@ -693,7 +693,7 @@ def test_gradient_of_a_solution_is_that_of_solving_again():
 
 def test_a_linear_system_is_solved_or_its_solution_is_nan():
     rng = np.random.default_rng(0)
-    n = RESTART + 10
+    n = MAX_DIRECTIONS + 10
     matrix = np.eye(n) + 0.5 * rng.standard_normal((n, n)) / np.sqrt(n)
     right = jnp.asarray(rng.standard_normal(n))
     solved = jax.jit(

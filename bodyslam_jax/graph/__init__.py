@@ -1,4 +1,4 @@
-"""What is estimated, and why: state, error terms, problem."""
+"""The factor graph: state, factors, robust losses and the problem to be solved."""
 
 from bodyslam_jax.geometry.lengths import round_up as round_up
 from bodyslam_jax.graph.check_factor import FactorReport as FactorReport

@@ -11,7 +11,7 @@ from jaxtyping import AbstractArray
 
 @functools.cache
 def array_annotations(kind: type[eqx.Module]) -> dict[str, type[AbstractArray]]:
-    """Fields annotated with a jaxtyping array, in the order of their declaration.
+    """Returns the fields annotated with a jaxtyping array, in their declared order.
 
     Annotations that are strings (`from __future__ import annotations`) are evaluated.
     """
@@ -29,7 +29,7 @@ def array_annotations(kind: type[eqx.Module]) -> dict[str, type[AbstractArray]]:
 
 
 def fields_with_axes(kind: type[eqx.Module], axes: tuple[str, ...]) -> tuple[str, ...]:
-    """Array fields whose leading axes are these, such as `("h", "t")`."""
+    """Returns the array fields whose leading axes are these, such as `("h", "t")`."""
     return tuple(
         name
         for name, array in array_annotations(kind).items()

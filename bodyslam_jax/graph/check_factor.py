@@ -1,4 +1,4 @@
-"""`check_factor`: whether a custom factor is one that the solver can rely on."""
+"""`check_factor` tests whether the solver can rely on a custom factor."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,9 +17,9 @@ from bodyslam_jax.graph.state import State, Step, moved_at_random
 from bodyslam_jax.graph.validation import check_measurements, check_state
 from bodyslam_jax.graph.validation_weights import check_precision
 
-_SAME = {"float64": 1e-9, "float32": 1e-4}
-"""Relative difference that rounding may make between two ways of computing a cost."""
-_VARIABLE = {
+_COST_RTOL = {"float64": 1e-9, "float32": 1e-4}
+"""Largest relative difference, by precision, of a cost computed in two ways."""
+_KEY_OF_FIELD = {
     "scale": "scale",
     "cameras": "camera",
     "roots": "root",
@@ -28,12 +28,12 @@ _VARIABLE = {
     "intrinsics": "intrinsics",
     "globals": "globals",
 }
-"""Fields of a state, and the names that `keys` has for them."""
+"""Names in `keys` of the fields of a state."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FactorReport:
-    """What `check_factor` found of a factor that passed."""
+    """Properties of a factor that passed `check_factor`."""
 
     name: str
     keys: tuple[tuple[str, int], ...]
@@ -106,12 +106,12 @@ def _finite_cost(factor: Factor, state: State, name: str) -> float:
 
 
 def _gradient_by_state(factor: Factor, state: State, name: str) -> dict[str, float]:
-    """Largest derivative by each group; refuses those that `keys` leaves out."""
+    """Returns the largest derivative by group; refuses groups missing in `keys`."""
     slope = _slope(factor, state)
     largest = {}
     for field, values in vars(slope).items():
         values = np.asarray(values)
-        variable = _VARIABLE.get(field)
+        variable = _KEY_OF_FIELD.get(field)
         if not np.isfinite(values).all():
             bad = int(np.sum(~np.isfinite(values)))
             raise ValueError(
@@ -145,7 +145,7 @@ def _check_gradient_by_measurements(factor: Factor, state: State, name: str) -> 
 
 
 def _check_transformed(factor: Factor, state: State, name: str) -> None:
-    """`jit` and `vmap` over two states give the cost that plain evaluation gives."""
+    """Refuses a factor whose cost changes under `jit` or `vmap` over two states."""
     plain = lambda f, s: f.cost(s)
     with jax.disable_jit():
         expected = np.asarray(plain(factor, state))
@@ -156,7 +156,7 @@ def _check_transformed(factor: Factor, state: State, name: str) -> None:
     }
     for way, cost in ways.items():
         found = np.asarray(_traced(name, way, cost))
-        if not np.allclose(found, expected, rtol=_SAME[str(state.scale.dtype)]):
+        if not np.allclose(found, expected, rtol=_COST_RTOL[str(state.scale.dtype)]):
             raise ValueError(
                 f"{name}.frame_residual: the cost is {found.ravel()[0]:.9g} under "
                 f"{way}, expected {expected:.9g} as without it."
@@ -164,7 +164,7 @@ def _check_transformed(factor: Factor, state: State, name: str) -> None:
 
 
 def _traced(name: str, way: str, call: Callable[[], Any]) -> Any:
-    """What `call` returns, or one line if it does what cannot be traced."""
+    """Returns `call()`; raises a `ValueError` of one line if it cannot be traced."""
     try:
         return call()
     except jax.errors.JAXTypeError as error:

@@ -1,4 +1,4 @@
-"""Changes of problems and states that keep all shapes: nothing is recompiled."""
+"""Edits of problems and states that keep all shapes, so that nothing is recompiled."""
 
 import dataclasses
 
@@ -18,12 +18,12 @@ from bodyslam_jax.graph.problem import Problem
 from bodyslam_jax.graph.state import State, Step, moved_at_random
 from bodyslam_jax.graph.tracing import is_traced
 
-_SAME = {"float64": 1e-9, "float32": 1e-4}
-"""Relative difference that rounding may make of a residual in two units of the map."""
+_RESIDUAL_RTOL = {"float64": 1e-9, "float32": 1e-4}
+"""Largest relative difference of a residual in two units of the map, by precision."""
 
 
 def disable(problem: Problem, *kinds: type[Factor]) -> Problem:
-    """The problem without the cost of its factors of these classes.
+    """Returns the problem without the cost of its factors of these classes.
 
     The factors stay, with all their measurements marked as missing.
     """
@@ -58,7 +58,7 @@ def _missing(factor: Factor, problem: Problem) -> Factor:
 
 
 def set_constant(free: Step, *names: str) -> Step:
-    """The mask with these variables (names of `State`'s fields) held constant."""
+    """Returns the mask with these variables (fields of `State`) held constant."""
     held = {name: jnp.zeros_like(getattr(free, name)) for name in names}
     return dataclasses.replace(free, **held)
 
@@ -68,14 +68,14 @@ def rescaled(
     state: State | Float[Array | np.ndarray, "*f"] | float,
     factor: Float[Array | np.ndarray, "*f"] | float | None = None,
 ) -> tuple[Problem, State]:
-    """A problem and a state of it in a map that is `factor` times as large.
+    """Returns the problem and its state in a map that is `factor` times as large.
 
     Camera centres and landmarks are multiplied by `factor`, and so is all that the
     problem's factors measure in units of the map (`Factor.rescaled`). The scale s
     stays, so that the state's lengths in metres grow by `factor`; a solve from there
-    ends with s divided by it. With `state.scale / factor` the cost is what it was.
+    ends with s divided by it. With `state.scale / factor` the cost is unchanged.
 
-    An array of factors gives a batch of both with the array's axes leading.
+    For an array of factors both are batches, with the array's axes leading.
 
     **Raises:** `ValueError` for a state alone, for a factor that is not above 0, and
     for a problem with a custom factor whose residual changes with the unit of the map:
@@ -157,7 +157,7 @@ def _check_units(factor: Factor, state: State) -> None:
     )
     before = np.asarray(factor.residual(moved))
     after = np.asarray(factor.rescaled(two).residual(larger))
-    same = _SAME[state.scale.dtype.name]
+    same = _RESIDUAL_RTOL[state.scale.dtype.name]
     size = float(abs(before).max(initial=0.0, where=np.isfinite(before)))
     if not np.allclose(after, before, same, same * size, equal_nan=True):
         raise ValueError(

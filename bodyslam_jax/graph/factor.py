@@ -21,18 +21,18 @@ from bodyslam_jax.graph.losses import Loss, Squared, squared_norm
 from bodyslam_jax.graph.state import State
 
 Key = tuple[str, int]
-"""A variable and how many frames back: `("camera", 1)` is the previous camera."""
+"""A variable and its lag in frames: `("camera", 1)` is the previous camera."""
 
-_OF_PEOPLE = ("root", "pose", "shape")
-_SHARED = ("scale", "shape", "intrinsics", "globals")
-BUILT_IN = ("camera", "root", "pose", *_SHARED)
+_PERSON_VARIABLES = ("root", "pose", "shape")
+_SHARED_VARIABLES = ("scale", "shape", "intrinsics", "globals")
+BUILT_IN_VARIABLES = ("camera", "root", "pose", *_SHARED_VARIABLES)
 """Names of variables that every state has; other names in `keys` are of named globals
 (`graph.globals`)."""
 
 
 class Frame(eqx.Module):
-    """The variables of one frame: of the camera, and of one person if the factor has
-    one residual for each person (`FrameFactor.of_people`)."""
+    """The variables of one frame: the camera's, and those of one person if the factor
+    has one residual for each person (`FrameFactor.of_people`)."""
 
     camera: Float[Array, "*b 4 4"]
     """T'_WC"""
@@ -42,12 +42,18 @@ class Frame(eqx.Module):
 
     @property
     def root(self) -> Float[Array, "*b 4 4"]:
-        """T_CH; `ValueError` in a factor without a variable of a person in `keys`."""
+        """Returns T_CH.
+
+        **Raises:** `ValueError` in a factor without a variable of a person in `keys`.
+        """
         return _of_person(self.person_root, "root")
 
     @property
     def pose(self) -> Float[Array, "*b 23 3"]:
-        """Joint rotations (axis-angle, rad); `ValueError` as for `root`."""
+        """Returns the joint rotations (axis-angle, rad).
+
+        **Raises:** `ValueError` as `root` does.
+        """
         return _of_person(self.person_pose, "pose")
 
 
@@ -64,7 +70,7 @@ class Shared(eqx.Module):
     """Name, start and end of each named global that the factor has in its `keys`."""
 
     def __getitem__(self, name: str) -> Float[Array, " n"]:
-        """The named global `name`.
+        """Returns the named global `name`.
 
         **Raises:** `ValueError` if `(name, 0)` is not among the factor's `keys`.
         """
@@ -78,7 +84,10 @@ class Shared(eqx.Module):
 
     @property
     def shape(self) -> Float[Array, " 10"]:
-        """SMPL β; `ValueError` in a factor without a variable of a person in `keys`."""
+        """Returns SMPL β.
+
+        **Raises:** `ValueError` in a factor without a variable of a person in `keys`.
+        """
         return _of_person(self.person_shape, "shape")
 
 
@@ -106,19 +115,19 @@ else:
 
 
 class Factor(eqx.Module, _Declared):
-    """Measurements of one kind, and how far a state is from explaining them."""
+    """Measurements of one kind, with their residual at a state and a robust loss."""
 
     map_units: ClassVar[Mapping[str, int] | None] = None
     """The power of the map's unit in each field that has one: `{"position": 1}` for
     lengths in the map, -1 for their inverse or for metres per unit of the map; `{}`
-    where there is none. Without it a factor is taken for one without, and `rescaled`
-    refuses the problem if the residual says otherwise."""
+    where there is none. `None` counts as `{}`, and `rescaled` then refuses the problem
+    if the residual changes with the unit."""
 
     if not TYPE_CHECKING:
         loss: eqx.AbstractVar[Loss]
 
     def rescaled(self, factor: Float[Array, ""]) -> "Factor":
-        """The same measurements in a map that is `factor` times as large: fields are
+        """Returns the factor in a map that is `factor` times as large: fields are
         multiplied by the powers of `factor` in `map_units`."""
         found = self
         for name, power in (self.map_units or {}).items():
@@ -128,24 +137,25 @@ class Factor(eqx.Module, _Declared):
 
     @abc.abstractmethod
     def residual(self, state: State) -> Float[Array, "*m d"]:
-        """Whitened, before the loss; one measurement has the last axis."""
+        """Returns the whitened residual, before the loss; the last axis is that of one
+        measurement."""
 
     def cost(self, state: State) -> Float[Array, ""]:
-        """Negative log-likelihood: `0.5 sum rho(|r|^2)`."""
+        """Returns the negative log-likelihood, `0.5 sum rho(|r|^2)`."""
         s = squared_norm(residual_of(self, state))
         return 0.5 * jnp.sum(self.loss.rho(s))
 
 
 def in_unit(value: Float[Array, "*b"], power: Float[Array, ""]) -> Float[Array, "*b"]:
-    """A quantity in another unit; infinite ones, as the sigma of what is missing, stay,
-    and have the derivative 0 by the unit."""
+    """Converts a quantity to another unit. Infinite values, such as the sigma of a
+    missing measurement, stay, and their derivative by the unit is 0."""
     known = jnp.isfinite(value)
     return jnp.where(known, jnp.where(known, value, 0.0) * power, value)
 
 
 @eqx.filter_jit
 def residual_of(factor: Factor, state: State) -> Array:
-    """`factor.residual(state)`, traced once wherever it is needed."""
+    """Returns `factor.residual(state)`, traced once wherever it is needed."""
     return factor.residual(state)
 
 
@@ -184,42 +194,46 @@ class FrameFactor(Factor):
     the residuals of appended frames are masked (`Masked`), which is always right and
     slightly slower."""
     per_joint = False
-    """Whether row j of the residual depends on joint j of the touched poses alone."""
+    """Whether row j of the residual depends only on joint j of the poses in `keys`."""
 
     if not TYPE_CHECKING:
 
         @property
         @abc.abstractmethod
         def keys(self) -> tuple[Key, ...]:
-            """The variables: among `camera`, `root`, `pose` with a lag, and `scale`,
-            `shape`, `intrinsics` with lag 0, and names of globals (`variables`) with
-            lag 0. A class attribute, or a property where they depend on the factor's
-            settings."""
+            """Variables with their lags: `camera`, `root`, `pose` with a lag, and
+            `scale`, `shape`, `intrinsics` with lag 0, and names of globals
+            (`variables`) with lag 0. A class attribute, or a property where they depend
+            on the factor's settings."""
 
     @property
     def touched(self) -> tuple[Key, ...]:
-        """`keys` with the vector of all globals in place of named ones."""
-        known = ((n, k) if n in BUILT_IN else ("globals", k) for n, k in self.keys)
+        """Returns `keys` with the vector of all globals in place of named ones."""
+        known = (
+            (n, k) if n in BUILT_IN_VARIABLES else ("globals", k) for n, k in self.keys
+        )
         return tuple(dict.fromkeys(known))
 
     @property
     def of_people(self) -> bool:
-        """Whether there is one residual for each person, or for the camera only."""
-        return any(name in _OF_PEOPLE for name, _ in self.keys)
+        """Returns True if there is one residual for each person."""
+        return any(name in _PERSON_VARIABLES for name, _ in self.keys)
 
     @property
     def time_fields(self) -> tuple[str, ...]:
-        """Array fields with leading axes `h t` (or `t`), which padding extends."""
+        """Returns the array fields with leading axes `h t` (or `t`): those padded."""
         axes = ("h", "t") if self.of_people else ("t",)
         return fields_with_axes(type(self), axes)
 
     @property
     def once(self) -> bool:
-        """Whether its measurements depend on no frame, and are counted once."""
-        return not self.time_fields and all(n in _SHARED for n, _ in self.touched)
+        """Returns True if the measurements depend on no frame, and are counted once."""
+        return not self.time_fields and all(
+            n in _SHARED_VARIABLES for n, _ in self.touched
+        )
 
     def data(self) -> Any:
-        """Measurements, leading axes `h t` (or `t`): by default a tuple of
+        """Returns the measurements, leading axes `h t` (or `t`): by default a tuple of
         `time_fields`, or of all arrays of a factor that is counted once."""
         if not self.once:
             return tuple(getattr(self, name) for name in self.time_fields)
@@ -231,7 +245,7 @@ class FrameFactor(Factor):
     def frame_residual(
         self, data: Any, window: tuple[Frame, ...], shared: Shared
     ) -> Float[Array, "*m d"]:
-        """The residual of one frame, one axis or more.
+        """Returns the residual of one frame, of one axis or more.
 
         `data` is `self.data()` of this frame; `window[lag]` has the variables of the
         frame that far back, `shared` those that all frames have in common.
@@ -240,13 +254,14 @@ class FrameFactor(Factor):
     def jacobian(
         self, data: Any, window: tuple[Frame, ...], shared: Shared
     ) -> tuple[Float[Array, "*m d"], dict[Key, Float[Array, "*m d n"]]] | None:
-        """The residual and, if known in closed form, its derivative by each touch."""
+        """Returns the residual and its derivatives by `touched`, or `None` where these
+        are not known in closed form."""
         return None
 
     def jacobians(
         self, state: State
     ) -> tuple[Float[Array, "*b d"], dict[Key, Float[Array, "*b d n"]]] | None:
-        """The same for all frames at once, leading axes `h t` (or `t`)."""
+        """Returns `jacobian` of all frames at once, leading axes `h t` (or `t`)."""
         return None
 
     @property
@@ -254,7 +269,7 @@ class FrameFactor(Factor):
         return 1 + max(lag for _, lag in self.keys)
 
     def frame_of_row(self, num_frames: int) -> Int[Array, " t"]:
-        """The frame whose variables each row of `map_frames` depends on."""
+        """Returns the frame whose variables each row of `map_frames` depends on."""
         return jnp.arange(num_frames)
 
     def map_frames(self, function, state: State, extra: Any = None):

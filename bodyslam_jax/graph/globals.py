@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from bodyslam_jax.graph.factor import BUILT_IN, Factor, FrameFactor, Key
+from bodyslam_jax.graph.factor import BUILT_IN_VARIABLES, Factor, FrameFactor, Key
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.tracing import is_traced
 
@@ -64,7 +64,7 @@ class GlobalPrior(FrameFactor):
 
 
 def bound(factor: Factor, named: Named) -> Factor:
-    """The factor with the places of the named globals that it depends on.
+    """Returns the factor with the slices of the named globals that it depends on.
 
     **Raises:** `ValueError` if one of them is not among `named`.
     """
@@ -77,7 +77,7 @@ def bound(factor: Factor, named: Named) -> Factor:
     if unknown:
         raise ValueError(
             f"{type(factor).__name__}.keys: no variable {unknown[0]!r}, expected among "
-            f"{[*BUILT_IN, *places]}; add it first: `problem, state = "
+            f"{[*BUILT_IN_VARIABLES, *places]}; add it first: `problem, state = "
             f"problem.with_variables(state, {unknown[0]}=Variable(value, sigma))`."
         )
     at = tuple(places[name] for name in names)
@@ -85,23 +85,26 @@ def bound(factor: Factor, named: Named) -> Factor:
 
 
 def named_keys(factor: Factor) -> tuple[str, ...]:
-    """Names of the named globals among a factor's `keys`."""
+    """Returns the names of the named globals among a factor's `keys`."""
     if not isinstance(factor, FrameFactor):
         return ()
-    return tuple(dict.fromkeys(n for n, _ in factor.keys if n not in BUILT_IN))
+    return tuple(
+        dict.fromkeys(n for n, _ in factor.keys if n not in BUILT_IN_VARIABLES)
+    )
 
 
 def vector_of(
     name: str, variable: Variable, dtype: Any
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """First value and standard deviation of a variable, as vectors.
+    """Returns the first value and standard deviation of a variable, as vectors.
 
     **Raises:** `ValueError` for a name that is taken or no identifier, a value that is
     not finite, or a sigma that is not above 0.
     """
-    if name in BUILT_IN or not name.isidentifier():
+    if name in BUILT_IN_VARIABLES or not name.isidentifier():
         raise ValueError(
-            f"variables: {name!r}, expected an identifier other than {list(BUILT_IN)}."
+            f"variables: {name!r}, expected an identifier other than "
+            f"{list(BUILT_IN_VARIABLES)}."
         )
     value = jnp.atleast_1d(jnp.asarray(variable.value, dtype))
     if value.ndim != 1 or not value.size:
@@ -119,7 +122,7 @@ def vector_of(
 def split(
     named: Named, values: Float[Array, "*b g"]
 ) -> Mapping[str, Float[Array, "*b _"]]:
-    """Each named global of a vector of all."""
+    """Returns each named global of a vector of all, by its name."""
     ends = list(itertools.accumulate(size for _, size in named))
     return {
         name: values[..., end - size : end]

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from bodyslam_jax.body.skeleton import ancestors
 from bodyslam_jax.graph.keypoint_jacobian import Carried, times
 
-_UPPER = np.kron(ancestors() - 0.5 * np.eye(24), np.ones((3, 3)))
+_ANCESTOR_MASK = np.kron(ancestors() - 0.5 * np.eye(24), np.ones((3, 3)))
 """1 where the joint of a coordinate (row) is an ancestor of that of the other, 1/2
 where both belong to one joint."""
 
@@ -24,8 +24,8 @@ def keypoint_curvature(
     found: Carried,
     pull: Float[Array, "k 3"],
 ) -> tuple[Float[Array, "72 72"], Float[Array, "72 10"]]:
-    """Second derivatives of `Σ_k pull_k · p_k` by rotations twice, and by rotations and
-    shape.
+    """Returns the second derivatives of `Σ_k pull_k · p_k` by rotations twice, and by
+    rotations and shape.
 
     Points (`carried_by_joints`, m) and `pull`, the gradient of the cost by them, are in
     H. Rotations (rad) are `Exp` on the right: of the whole body about the pelvis, then
@@ -42,7 +42,7 @@ def keypoint_curvature(
     trace = M[:, 0, 0] + M[:, 1, 1] + M[:, 2, 2]
     crossed = times(M, G) - trace[:, None, None] * G
     axes, crossed = (y.swapaxes(1, 2).reshape(72, 3) for y in (G, crossed))
-    product = jnp.asarray(_UPPER, M.dtype) * (axes @ crossed.T)
+    product = jnp.asarray(_ANCESTOR_MASK, M.dtype) * (axes @ crossed.T)
     turns = product + product.T
 
     arms = found.lever_by_shape.transpose(0, 1, 3, 2).reshape(720, -1) @ pull
@@ -54,7 +54,7 @@ def keypoint_curvature(
 
 
 def _crossed(y: Float[Array, "i 3 s 3"]) -> Float[Array, "i 3 s"]:
-    """`Σ a x b` from `Σ a b^T`."""
+    """Returns `Σ a x b` from `Σ a b^T`."""
     return jnp.stack(
         [y[:, i - 2, :, i - 1] - y[:, i - 1, :, i - 2] for i in range(3)], 1
     )

@@ -33,11 +33,11 @@ class Carried(NamedTuple):
     share: Float[Array, "24 k"]
     """Weights of skinning, 1."""
     lever: Float[Array, "24 k 3"]
-    """From the joint to the keypoint, in the joint's axes, times the share."""
+    """Vector from joint to keypoint in the joint's axes, times the share, m."""
     x_by_shape: Float[Array, "24 3 10"]
     lever_by_shape: Float[Array, "24 3 k 10"]
     vertex: Int[Array, " k"]
-    """Of the skin, for those keypoints that are on it."""
+    """Vertex of the skin of each keypoint that is on it."""
     on_skin: Bool[np.ndarray, " k"]
 
 
@@ -49,8 +49,8 @@ def carried_by_joints(
     bias: float | Float[Array, ""],
     points: tuple[int, ...] | None = None,
 ) -> Carried:
-    """Rotations and positions of joints, and keypoints relative to them: all of the
-    layout's, or those with these numbers."""
+    """Returns rotations and positions of joints, and keypoints relative to them: all of
+    the layout's, or those with the indices `points`."""
     dtype = R.dtype
     names = KEYPOINT_NAMES[layout]
     names = names if points is None else tuple(names[i] for i in points)
@@ -106,7 +106,8 @@ def carried_by_joints(
 
 
 def placed(found: Carried) -> Float[Array, "24 k 3"]:
-    """The share of each joint in each keypoint, m, in H; keypoints are their sums."""
+    """Returns the contribution of each joint to each keypoint, m, in H; keypoints are
+    their sums."""
     turned = times(found.lever, found.G.swapaxes(-1, -2))
     return found.share[..., None] * found.x[:, None] + turned
 
@@ -119,8 +120,9 @@ def keypoint_jacobian(
     bias: float | Float[Array, ""],
     points: tuple[int, ...] | None = None,
 ) -> tuple[Float[Array, "k 3"], Float[Array, "3 k 69"], Float[Array, "k 3 10"]]:
-    """`local_keypoints`, and its derivatives by `Exp` on the right of each joint, and
-    by shape; of all keypoints, or of those with these numbers."""
+    """Returns `local_keypoints` with the derivatives by `Exp` on the right of each
+    joint (m/rad), and by shape; of all keypoints, or of those with the indices
+    `points`."""
     dtype = pose.dtype
     R = so3.exp(pose)
     found = carried_by_joints(body, R, shape, layout, bias, points)
@@ -161,7 +163,7 @@ def keypoint_jacobian(
 
 
 def turns_of(R: Float[Array, "23 3 3"]) -> Float[Array, "24 3 3"]:
-    """Rotations of the joints in H, by doubling the length of the path at each step."""
+    """Returns rotations of the joints in H; each pass doubles the path's length."""
     G = jnp.concatenate([jnp.eye(3, dtype=R.dtype)[None], R])
     above = np.maximum(np.array(PARENTS), 0)
     for _ in range(4):  # 2^4 is more than the depth of the tree
@@ -171,6 +173,6 @@ def turns_of(R: Float[Array, "23 3 3"]) -> Float[Array, "24 3 3"]:
 
 
 def times(a: Float[Array, "*b i c"], b: Float[Array, "*b c j"]) -> Array:
-    """Products of many small matrices as fused sums, faster than a batched GEMM."""
+    """Multiplies many small matrices as fused sums, faster than a batched GEMM."""
     term = lambda c: a[..., :, c, None] * b[..., c, None, :]
     return sum((term(c) for c in range(1, a.shape[-1])), term(0))

@@ -20,10 +20,10 @@ from jaxtyping import Array, Int
 from bodyslam_jax.geometry.lengths import round_up
 from bodyslam_jax.graph import sizes
 from bodyslam_jax.graph.long_tracks import choose_long_tracks
-from bodyslam_jax.graph.ordering import CHUNK, PERSON, order_chunks
+from bodyslam_jax.graph.ordering import CHUNK, PERSON_COORDINATES, order_chunks
 
 _WIDTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128, 192, 256, 512)
-_SIZE = 24
+_GROUP_LANDMARKS = 24
 """Landmarks in a group. Run time has a flat minimum between 16 and 32; a size that
 depended on the tracks would compile a program for each video."""
 _MAX_BUCKETS = 3
@@ -47,7 +47,7 @@ class Bucket(eqx.Module):
 
 
 class Layout(eqx.Module):
-    """How a problem of `t` frames is cut into blocks: static sizes and index tables."""
+    """The blocks of a problem of `t` frames: static sizes and index tables."""
 
     buckets: tuple[Bucket, ...]
     num_chunks: int = eqx.field(static=True)
@@ -69,8 +69,8 @@ class Layout(eqx.Module):
     """The bandwidth of these tracks; `None` for `bandwidth`."""
 
     def all_used(self) -> "Layout":
-        """The same without the numbers of what is in use: loops over all of it are
-        differentiable backwards."""
+        """Returns the layout without the counts of used rows: loops over all rows are
+        differentiable in reverse mode."""
         buckets = tuple(dataclasses.replace(b, used=None) for b in self.buckets)
         return dataclasses.replace(
             self, buckets=buckets, used=None, used_bandwidth=None
@@ -78,7 +78,7 @@ class Layout(eqx.Module):
 
     @property
     def lasting(self) -> int:
-        """Number of landmarks, with padding, that are eliminated with the globals."""
+        """Returns the padded number of landmarks eliminated with the globals."""
         return sum(b.landmark.size for b in self.buckets if b.lasting)
 
 
@@ -92,10 +92,10 @@ def make_layout(
     common_sizes: bool = True,
     front: int = 0,
 ) -> Layout:
-    """Groups `m` observations of landmarks. Indices are not checked.
+    """Groups `m` observations of landmarks in tables. Indices are not checked.
 
-    Without `common_sizes`, or if there is none that holds the problem, its tables are
-    as large as it needs.
+    Without `common_sizes`, or if none of these holds the problem, its tables are as
+    large as it needs.
 
     `front` is the number of chunks that a `MarginalPrior` couples, the first ones. With
     it the order is that of time, and no landmark is lasting.
@@ -117,7 +117,7 @@ def _in_size(
     landmark: Int[np.ndarray, " m"],
     front: int,
 ) -> Layout | None:
-    """The layout of a problem in tables of a given size; `None` if it does not fit."""
+    """Returns the layout in tables of a given size; `None` if it does not fit."""
     count = -(-num_frames // CHUNK)
     fits = (
         count <= size.chunks
@@ -169,18 +169,18 @@ def _of_own_size(
     num_people: int,
     front: int,
 ) -> Layout:
-    """The layout of a problem whose sizes are its own, rounded up. So are those of
-    many frames or landmarks, or of long tracks, which fit in no common size."""
+    """Returns the layout in tables of the problem's own size, rounded up: for many
+    frames or landmarks, or long tracks, which fit in no common size."""
     count = -(-num_frames // CHUNK)
     num_chunks = round_up(count, parts=8)
     room = round_up(num_landmarks + 1), round_up(len(frame) + 1)
     if len(frame) == 0:
         return Layout((), num_chunks, max(front, 2), None, 1, *room)
-    own = num_people * PERSON
+    own = num_people * PERSON_COORDINATES
     pairs = np.unique(landmark.astype(int) * count + frame // CHUNK)
     # In any order, a landmark's span is at least the number of chunks that observe it.
     least = np.bincount(pairs // count, minlength=num_landmarks)
-    lasting = choose_long_tracks(least, num_chunks, own, 1, _SIZE)
+    lasting = choose_long_tracks(least, num_chunks, own, 1, _GROUP_LANDMARKS)
     rest = pairs[~np.isin(pairs // count, lasting)]
     order, reach = None, 1
     if not front:
@@ -191,7 +191,7 @@ def _of_own_size(
         # From here on, frames are numbered in the order of elimination.
         frame = np.argsort(order)[frame // CHUNK] * CHUNK + frame % CHUNK
     start, span = _spans(num_landmarks, frame, landmark)
-    lasting = choose_long_tracks(span, num_chunks, own, reach, _SIZE)
+    lasting = choose_long_tracks(span, num_chunks, own, reach, _GROUP_LANDMARKS)
     if front:
         lasting = lasting[:0]
     soon = span > 0
@@ -207,7 +207,7 @@ def _of_own_size(
     ]
     if len(lasting):
         lasting = lasting[np.argsort(start[lasting], kind="stable")]
-        groups = np.split(lasting, len(lasting) // _SIZE)
+        groups = np.split(lasting, len(lasting) // _GROUP_LANDMARKS)
         needed = max(np.ptp(np.r_[start[k], start[k] + span[k]]) for k in groups)
         width = next(w for w in _allowed(num_chunks) if w >= needed)
         chunks = [min(start[k].min(), num_chunks - width) for k in groups]
@@ -221,8 +221,8 @@ def _of_own_size(
 
 
 def _spans(num_landmarks, frame, landmark):
-    """The first chunk that observes each landmark, and the number of chunks from it to
-    the last; 0 for landmarks without observations."""
+    """Returns the first chunk that observes each landmark, and the number of chunks
+    from it to the last; 0 for landmarks without observations."""
     first = np.full(num_landmarks, np.iinfo(np.int32).max)
     last = np.full(num_landmarks, -1)
     np.minimum.at(first, landmark, frame)
@@ -233,12 +233,12 @@ def _spans(num_landmarks, frame, landmark):
 
 
 def _allowed(num_chunks):
-    """Widths that tables may have."""
+    """Returns the widths that tables may have, in chunks."""
     return [w for w in _WIDTHS if w < num_chunks] + [num_chunks]
 
 
 def _choose_widths(span, num_chunks):
-    """At most three widths of tables, chosen to minimise empty entries.
+    """Returns at most three widths of tables, chosen to minimise empty entries.
 
     Each additional width must save a tenth of the cost: it adds to compilation, and
     wide groups can hold short tracks too.
@@ -258,15 +258,16 @@ def _choose_widths(span, num_chunks):
 
 
 def _pack(start, stop, widths, num_chunks, most=None):
-    """Groups of up to `_SIZE` landmarks, the longest tracks first: for each width, the
-    first chunk of each group and its members.
+    """Packs landmarks into groups of `_GROUP_LANDMARKS`, the longest tracks first.
+
+    Returns, for each width, the first chunk of each group and its members.
 
     A group holds landmarks whose tracks begin and end within it, shorter ones where
     there is room. The number of groups is rounded up, filled with shorter tracks: empty
     entries cost as much as full ones.
 
-    With `most`, the number of groups of each width that there is room for, every width
-    is in the result, and unused groups stay empty; `None` where there is no room.
+    With `most`, the largest number of groups of each width, every width is in the
+    result, and unused groups stay empty; it is `None` where the tracks do not fit.
     """
     order = np.lexsort((stop, start))
     start, stop = start[order], stop[order]
@@ -294,7 +295,7 @@ def _pack(start, stop, widths, num_chunks, most=None):
             taken = np.concatenate(
                 [np.flatnonzero(fits & due[near]), np.flatnonzero(fits & ~due[near])]
             )
-            taken = near.start + taken[:_SIZE]
+            taken = near.start + taken[:_GROUP_LANDMARKS]
             free[taken] = False
             chunks.append(chunk)
             groups.append(order[taken])
@@ -304,19 +305,19 @@ def _pack(start, stop, widths, num_chunks, most=None):
 
 
 def _fill(chunks, groups, width, frame, rows, begin, n=None):
-    """The tables of one bucket, of `n` groups or as many as there are, rounded up."""
+    """Returns one bucket of `n` groups, or of as many as there are, rounded up."""
     num_rows, num_landmarks = len(rows), len(begin) - 1
     n = round_up(len(groups)) if n is None else n
     first_chunk = np.zeros(n, np.int32)
     first_chunk[: len(groups)] = chunks
-    table = np.full((n, _SIZE), num_landmarks, np.int32)
+    table = np.full((n, _GROUP_LANDMARKS), num_landmarks, np.int32)
     count = np.array([len(group) for group in groups], int)
     group = np.repeat(np.arange(len(groups)), count)
     none = np.zeros(0, int)
     slot = np.concatenate([none, *(np.arange(c) for c in count)])
     members = np.concatenate([none, *groups])
     table[group, slot] = members
-    row = np.full((n, width * CHUNK, _SIZE), num_rows, np.int32)
+    row = np.full((n, width * CHUNK, _GROUP_LANDMARKS), num_rows, np.int32)
     length = begin[members + 1] - begin[members]
     which = np.repeat(np.arange(len(members)), length)
     within = np.arange(length.sum()) - np.repeat(np.cumsum(length) - length, length)

@@ -11,20 +11,20 @@ from jaxtyping import Int
 
 from bodyslam_jax.graph.ordering import CAMERAS, CHUNK
 
-_PLACE = 5000.0
+_TABLE_CHUNK_COST = 5000.0
 """Cost of one chunk of a landmark's table, in multiplications."""
-_GAIN = 0.8
+_MAX_COST_RATIO = 0.8
 """The cost must fall below this share of the cost without long tracks."""
-_GROUPS = (1, 2, 4, 8, 16)
+_GROUP_COUNTS = (1, 2, 4, 8, 16)
 """Allowed numbers of groups: few, so that videos share a program."""
-_SHARE = 0.1
+_MAX_LANDMARK_SHARE = 0.1
 """Largest share of all landmarks."""
 
 
 def choose_long_tracks(
     span: Int[np.ndarray, " l"], num_chunks: int, own: int, reach: int, size: int
 ) -> Int[np.ndarray, " k"]:
-    """Indices of the landmarks to be eliminated with the globals, longest first.
+    """Returns the landmarks to be eliminated with the globals, longest track first.
 
     Their number `k` is a multiple of `size`; it is 0 unless this is clearly cheaper.
 
@@ -42,12 +42,12 @@ def choose_long_tracks(
     """
     order = np.argsort(-span, kind="stable")
     ranked = span[order].astype(float)
-    most = _SHARE * np.sum(span > 0)
-    counts = [0, *(size * n for n in _GROUPS if size * n <= most)]
+    most = _MAX_LANDMARK_SHARE * np.sum(span > 0)
+    counts = [0, *(size * n for n in _GROUP_COUNTS if size * n <= most)]
     pivot = own + CAMERAS
 
     def cost(count):
-        """Multiplications to factorise the chain of chunks, eliminate the remaining
+        """Returns the multiplications to factorise the chain, eliminate the remaining
         landmarks and build the tables, with `count` long tracks."""
         rest = ranked[count:]
         width = int(max(rest[0] - 1, reach))
@@ -56,11 +56,11 @@ def choose_long_tracks(
         rows = CAMERAS * (width - back) + people + 3 * count
         chunk = np.sum(rows * (CAMERAS + people)) + pivot * (rows[:1].sum() + pivot)
         chunk += (3 * count) ** 2
-        tables = _PLACE * CHUNK * (rest.sum() + count * num_chunks)
+        tables = _TABLE_CHUNK_COST * CHUNK * (rest.sum() + count * num_chunks)
         return num_chunks * pivot * chunk + 1.5 * CAMERAS**2 * np.sum(rest**2) + tables
 
     if len(counts) == 1:
         return order[:0]
     costs = [cost(count) for count in counts]
     best = int(np.argmin(costs))
-    return order[: counts[best] if costs[best] < _GAIN * costs[0] else 0]
+    return order[: counts[best] if costs[best] < _MAX_COST_RATIO * costs[0] else 0]

@@ -26,7 +26,7 @@ class Loss(eqx.Module):
 
     @abc.abstractmethod
     def weight(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
-        """The derivative of `rho`: (nearly) 1 at 0, and never negative."""
+        """Returns the derivative of `rho`: (nearly) 1 at 0, and never negative."""
 
 
 class Squared(Loss):
@@ -57,7 +57,7 @@ class GemanMcClure(Loss):
     """`rho(s) = c^2 s / (c^2 + s)`: saturates at `c^2`.
 
     Bogo et al. (2016) apply it to x and y apart, with c = 100 px; here it takes the
-    length of the pixel error, which does not depend on how the image is turned.
+    length of the pixel error, which is invariant to rotation of the image.
     """
 
     scale: float | Float[Array, "..."]
@@ -97,7 +97,7 @@ class BlakeZisserman(Loss):
     def rho(self, s: Float[Array, "*m"]) -> Float[Array, "*m"]:
         never = -(self.scale**2) / 2
         far = jax.nn.softplus(never) - jnp.logaddexp(-s / 2, never)
-        # The same without cancellation, where the logarithms are nearly equal.
+        # An equal expression without cancellation, where the logarithms are close.
         less = jnp.expm1(-jnp.minimum(s, 1) / 2)
         near = -jnp.log1p(less * jax.nn.sigmoid(-never))
         return 2 * jnp.where(s < 1, near, far)
@@ -107,7 +107,8 @@ class BlakeZisserman(Loss):
 
 
 def squared_norm(residual: Float[Array, "*m d"]) -> Float[Array, "*m"]:
-    """Of each measurement; unrolled for up to three coordinates, which is faster."""
+    """Returns the squared norm of each measurement, unrolled for up to three
+    coordinates, which is faster."""
     if residual.shape[-1] > 3:
         return jnp.sum(residual**2, axis=-1)
     return sum(
@@ -117,7 +118,7 @@ def squared_norm(residual: Float[Array, "*m d"]) -> Float[Array, "*m"]:
 
 
 def robustify(loss: Loss, residual: Float[Array, "*m d"]) -> Float[Array, "*m d+1"]:
-    """Residuals whose squared norm is the robust cost (see the module)."""
+    """Returns residuals whose squared norm is the robust cost (see the module)."""
     s = squared_norm(residual)
     fixed = jax.lax.stop_gradient(s)
     weight = jax.lax.stop_gradient(loss.weight(fixed))

@@ -9,17 +9,17 @@ from bodyslam_jax.graph.layout import Layout
 from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.state import State
 
-_LIMITS = (
+_CGROUP_LIMIT_FILES = (
     "/sys/fs/cgroup/memory.max",
     "/sys/fs/cgroup/memory/memory.limit_in_bytes",
 )
-"""Memory limit of a container (cgroup v2, v1); no number, or a huge one, without."""
+"""Memory limit of a container (cgroup v2, v1); `max`, or a huge number, without."""
 
 
 def memory() -> int:
-    """Bytes of memory of this machine, or of its container's limit."""
+    """Returns the bytes of memory of this machine, or of its container's limit."""
     found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
-    for name in _LIMITS:
+    for name in _CGROUP_LIMIT_FILES:
         try:
             found.append(int(Path(name).read_text()))
         except (OSError, ValueError):
@@ -28,7 +28,7 @@ def memory() -> int:
 
 
 def memory_needed(layout: Layout, state: State, pose: int) -> int:
-    """Bytes of the solver's tables, about; `pose` coordinates of a posture."""
+    """Estimates the bytes of the solver's tables for postures of `pose` coordinates."""
     item = state.scale.dtype.itemsize
     people = len(state.roots)
     person = pose + 12  # what remains of a chunk: a posture and two roots

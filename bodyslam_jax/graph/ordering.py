@@ -19,15 +19,15 @@ CHUNK = 10
 """Frames in a chunk."""
 CAMERAS = 6 * CHUNK
 """Coordinates of a chunk's cameras."""
-PERSON = 81
+PERSON_COORDINATES = 81
 """Approximate number of a person's coordinates that are left in a chunk after its inner
 frames are eliminated."""
-_GAIN = 0.7
+_MAX_COST_RATIO = 0.7
 """Chunks are reordered only if the cost falls below this share of the cost in the order
 of time, as reordering needs gathers."""
-_TOGETHER = 4096
-"""Landmarks processed at once."""
-_MOST = 2000
+_LANDMARK_BATCH = 4096
+"""Number of landmarks that are processed at once."""
+_MAX_CHUNKS = 2000
 """Largest number of chunks: their graph is a dense table, then of 32 MB."""
 
 
@@ -46,34 +46,34 @@ def order_chunks(
     count: int,
     num_people: int,
 ) -> Ordering:
-    """The order of time of `count` chunks, unless another costs clearly less.
+    """Returns the order of time of `count` chunks, unless another costs much less.
 
     `landmark` and `chunk` are `p` distinct pairs of a landmark and a chunk that
     observes it, sorted by landmark.
     """
     in_time = Ordering(None, 1)
     begin = np.flatnonzero(np.diff(landmark, prepend=-1))
-    own = num_people * PERSON
+    own = num_people * PERSON_COORDINATES
 
     def cost(place, reach):
-        """Multiplications for the factorisation of all chunks and for landmarks."""
+        """Returns the multiplications to factorise chunks and eliminate landmarks."""
         at = place[chunk]
         span = np.maximum.reduceat(at, begin) - np.minimum.reduceat(at, begin) + 1.0
         rows = reach * own + max(span.max() - 1, reach) * CAMERAS
         return count * (own + CAMERAS) * rows**2 + 3 * CAMERAS**2 * np.sum(span**2)
 
-    if not 3 < count <= _MOST:
+    if not 3 < count <= _MAX_CHUNKS:
         return in_time
     order = _spectral(landmark, chunk, begin, count)
     place = np.argsort(order)
     reach = int(np.abs(np.diff(place)).max())
-    if cost(place, reach) > _GAIN * cost(np.arange(count), 1):
+    if cost(place, reach) > _MAX_COST_RATIO * cost(np.arange(count), 1):
         return in_time
     return Ordering(order, reach)
 
 
 def _spectral(landmark, chunk, begin, count) -> Int[np.ndarray, " c"]:
-    # One landmark widens the band as much as a hundred do.
+    # The logarithm, as one landmark widens the band as much as a hundred.
     shared = np.log1p(_shared(landmark, chunk, begin, count))
     k = np.arange(count - 1)
     # Neighbours in time are always connected: people couple them, and the graph must
@@ -88,12 +88,12 @@ def _spectral(landmark, chunk, begin, count) -> Int[np.ndarray, " c"]:
 
 
 def _shared(landmark, chunk, begin, count) -> Float[np.ndarray, "c c"]:
-    """Number of landmarks that both of two chunks observe."""
+    """Returns the number of landmarks that both of two chunks observe."""
     shared = np.zeros((count, count))
     row = np.searchsorted(landmark[begin], landmark)
-    for first in range(0, len(begin), _TOGETHER):
-        here = slice(*np.searchsorted(row, [first, first + _TOGETHER]))
-        observes = np.zeros((_TOGETHER, count), np.float32)
+    for first in range(0, len(begin), _LANDMARK_BATCH):
+        here = slice(*np.searchsorted(row, [first, first + _LANDMARK_BATCH]))
+        observes = np.zeros((_LANDMARK_BATCH, count), np.float32)
         observes[row[here] - first, chunk[here]] = 1
         shared += observes.T @ observes
     return shared

@@ -22,8 +22,8 @@ from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State, moved_at_random
 from bodyslam_jax.graph.tracing import is_traced
 
-_RTOL = {"float64": 1e-8, "float32": 1e-3}
-"""Allowed relative difference of costs."""
+_COST_RTOL = {"float64": 1e-8, "float32": 1e-3}
+"""Allowed relative difference of costs, by precision."""
 
 
 class Masked(FrameFactor):
@@ -96,7 +96,7 @@ def _zero_unless(present: Array, x: Array) -> Array:
 
 
 def pad_factor(factor: FrameFactor, state: State, frames: int) -> FrameFactor:
-    """The factor with `frames` frames of weight 0 appended to those of `state`.
+    """Returns the factor with `frames` frames of weight 0 after those of `state`.
 
     A loss with a scale for each measurement is extended, too.
     """
@@ -126,13 +126,13 @@ def pad_factor(factor: FrameFactor, state: State, frames: int) -> FrameFactor:
 
 
 def _is_over_frames(factor: FrameFactor) -> bool:
-    """Whether each residual belongs to a frame: not if it is counted once, or if the
-    class overrides `map_frames`."""
+    """Returns True if each residual belongs to a frame: not if it is counted once, or
+    if the class overrides `map_frames`."""
     return not factor.once and type(factor).map_frames is FrameFactor.map_frames
 
 
 def extend_state(state: State, frames: int) -> State:
-    """The same state with its last frame repeated."""
+    """Returns the state with its last frame repeated `frames` times."""
     return dataclasses.replace(
         state,
         cameras=extend(state.cameras, 0, frames, "edge"),
@@ -142,8 +142,8 @@ def extend_state(state: State, frames: int) -> State:
 
 
 def extend(x: Array, axis: int, count: int, fill: Any) -> Array:
-    """The array with `count` entries appended along an axis: `fill`, or copies of the
-    last entry if `fill` is `"edge"`.
+    """Returns the array with `count` entries appended along an axis: `fill`, or copies
+    of the last entry if `fill` is `"edge"`.
 
     Uses NumPy outside of `jit`: JAX would compile one small program per shape.
     """
@@ -200,7 +200,7 @@ def check_padding(factor: FrameFactor, state: State) -> None:
             len(state.cameras),
         )
     )
-    tolerance = _RTOL[state.scale.dtype.name]
+    tolerance = _COST_RTOL[state.scale.dtype.name]
     if not np.isclose(found, expected, tolerance, tolerance, equal_nan=True):
         raise ValueError(
             f"{name}.padding: with {frames} frames more, which are to measure nothing, "
@@ -211,7 +211,7 @@ def check_padding(factor: FrameFactor, state: State) -> None:
 
 @eqx.filter_jit
 def _costs(factor, padded, state, num_frames):
-    """Costs with padding and without, at a perturbed state."""
+    """Returns the costs with and without padding, at a perturbed state."""
     moved = moved_at_random(state)
     cut = dataclasses.replace(
         moved,

@@ -2,8 +2,8 @@
 
     d_k = C_WH,k-1^T (r_WH,k - r_WH,k-1),    r_WH = s r'_WC + C_WC r_CH
 
-In closed form for all frames at once; forward differentiation would carry about forty
-tangents.
+Derivatives are in closed form for all frames at once; forward differentiation would
+carry about forty tangents.
 """
 
 import jax.numpy as jnp
@@ -14,12 +14,12 @@ from bodyslam_jax.graph.state import State
 
 
 def previous_frame(x: Float[Array, "h t *b"]) -> Float[Array, "h t *b"]:
-    """The values of the previous frame; of the first frame, its own."""
+    """Returns the values of the previous frame; for the first frame, its own."""
     return jnp.concatenate([x[:, :1], x[:, :-1]], axis=1)
 
 
 def displacement(previous: Frame, now: Frame, scale: Array) -> Float[Array, " 3"]:
-    """`C_WH,k-1^T (r_WH,k - r_WH,k-1)`, m."""
+    """Returns `C_WH,k-1^T (r_WH,k - r_WH,k-1)`, m."""
     moved = scale * (now.camera[:3, 3] - previous.camera[:3, 3])
     moved = moved + now.camera[:3, :3] @ now.root[:3, 3]
     moved = moved - previous.camera[:3, :3] @ previous.root[:3, 3]
@@ -29,7 +29,7 @@ def displacement(previous: Frame, now: Frame, scale: Array) -> Float[Array, " 3"
 def displacements(
     state: State,
 ) -> tuple[Float[Array, "h t 3"], dict[str, Float[Array, "h t 3 _"]]]:
-    """`d` in m, and its derivatives by the camera and the root of this frame (`camera`,
+    """Returns `d` in m, and its derivatives by camera and root of this frame (`camera`,
     `root`) and of the previous one (`camera_1`, `root_1`), and by the scale."""
     camera = jnp.broadcast_to(state.cameras, state.roots.shape)
     s = state.scale
@@ -60,10 +60,10 @@ def displacements(
 
 
 def _by_rotation(C: Float[Array, "*b 3 3"], r: Float[Array, "*b 3"]) -> Array:
-    """`d (C Exp(ω) r) / dω = -C [r]x`: each row a cross product."""
+    """Returns `d (C Exp(ω) r) / dω = -C [r]x`: each row is a cross product."""
     return jnp.cross(jnp.broadcast_to(r[..., None, :], C.shape), C)
 
 
 def _cross_matrix(r: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
-    """`[r]x`"""
+    """Returns `[r]x`."""
     return jnp.cross(jnp.eye(3, dtype=r.dtype), r[..., None, :])

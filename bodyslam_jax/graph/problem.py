@@ -50,6 +50,7 @@ VARIABLES = (
     *("scale", "cameras", "roots", "poses", "shapes", "landmarks", "intrinsics"),
     "globals",
 )
+"""Groups of variables: the fields of `State`."""
 
 
 class MotionPredictor(eqx.Module):
@@ -64,8 +65,8 @@ class MotionPredictor(eqx.Module):
     present: Bool[Array, "h t"]
 
     def lengthened(self, frames: int) -> "MotionPredictor":
-        """The same for sequences with frames added at the end, in which nobody is
-        present, up to `frames`."""
+        """Returns the predictor for `frames` frames, with nobody present in those that
+        are added at the end."""
         present = extend(self.present, 1, frames - self.present.shape[1], False)
         of_clock = lambda x: isinstance(x, Clock)
         stretch = lambda x: x.lengthened(frames) if of_clock(x) else x
@@ -73,21 +74,21 @@ class MotionPredictor(eqx.Module):
         return dataclasses.replace(self, model=model, present=present)
 
     def from_frame(self, start: int) -> "MotionPredictor":
-        """The same for the sequence from a frame on."""
+        """Returns the predictor for the sequence from frame `start` on."""
         of_clock = lambda x: isinstance(x, Clock)
         cut = lambda x: x.from_frame(start) if of_clock(x) else x
         model = jax.tree.map(cut, self.model, is_leaf=of_clock)
         return dataclasses.replace(self, model=model, present=self.present[:, start:])
 
     def __call__(self, state: State) -> Any:
-        """Predictions of all people; leading axes `h t`."""
+        """Returns the predictions of all people; leading axes `h t`."""
         orientation = state.cameras[:, :3, :3] @ state.roots[..., :3, :3]
         one = lambda *person: self.predict(self.model, self.body, *person)
         return jax.vmap(one)(orientation, state.poses, state.shapes, self.present)
 
 
 class Problem(eqx.Module):
-    """What `solve` minimises: the sum of the costs of its factors."""
+    """A sum of the costs of factors, which `solve` minimises over a state."""
 
     factors: tuple[Factor, ...]
     free: Step
@@ -100,16 +101,16 @@ class Problem(eqx.Module):
     globals: Named = eqx.field(static=True, default=())
     """Names and sizes of the variables in `State.globals`."""
     basis: Float[Array, "69 k"] | None = None
-    """Orthonormal columns: the turns of the 23 joints (rad, each in its own frame) that
-    a step may give a posture. What they do not span of a posture stays as it is in the
-    first state. `None` for all turns."""
+    """Orthonormal columns that span the turns of the 23 joints (rad, each in its own
+    frame) in a step. The part of a posture that they do not span stays as in the first
+    state. `None` for all turns."""
 
     def cost(self, state: State, *, held: bool = False) -> Float[Array, ""]:
-        """Negative log-likelihood, up to a constant.
+        """Returns the negative log-likelihood, up to a constant.
 
         Predictions of the motion model are made at `state`, and no gradient flows
-        through them; with `held` they are those that the factors have, as within a step
-        of the solver.
+        through them; with `held` they are those in the factors, as within a step of the
+        solver.
         """
         costs = self.cost_by_term(state, held=held).values()
         return sum(costs, jnp.zeros_like(state.scale))
@@ -117,15 +118,15 @@ class Problem(eqx.Module):
     def cost_by_term(
         self, state: State, *, held: bool = False
     ) -> dict[str, Float[Array, ""]]:
-        """The cost of each factor, by the name of its class; `held` as in `cost`."""
+        """Returns the cost of each factor by its class's name; `held` as in `cost`."""
         problem = self if held else self.refresh(state)
         costs = [factor.cost(state) for factor in problem.factors]
         return dict(zip(self.names, costs, strict=True))
 
     @property
     def names(self) -> list[str]:
-        """Names of the terms: those of the factors' classes, numbered from the second
-        factor of a class on."""
+        """Returns the names of the terms: the factors' classes, numbered from the
+        second factor of a class on."""
         names: list[str] = []
         for factor in self.factors:
             inner = factor.factor if isinstance(factor, Masked) else factor
@@ -135,7 +136,7 @@ class Problem(eqx.Module):
         return names
 
     def predict(self, state: State, *, frozen: bool = True) -> Any:
-        """The motion model's prediction at a state; `None` without a motion model.
+        """Returns the motion model's prediction at a state, `None` without a model.
 
         With `frozen`, no gradient flows through the network. Otherwise postures would
         be moved to where the network happens to predict the displacements that the
@@ -153,22 +154,22 @@ class Problem(eqx.Module):
         }
 
     def with_prediction(self, prediction: Any) -> "Problem":
-        """The same problem with a prediction (`predict`) in its factors; where it says
-        that it is not valid, as the sequence does not hold its window, they keep what
-        they have."""
+        """Returns the problem with a prediction (`predict`) in its factors; they keep
+        their own where it is not valid, as the sequence does not hold its whole
+        window."""
         if prediction is None:
             return self
         factors = tuple(_with_prediction(f, prediction) for f in self.factors)
         return eqx.tree_at(lambda p: p.factors, self, factors)
 
     def refresh(self, state: State) -> "Problem":
-        """The same problem with the motion model's prediction at `state`."""
+        """Returns the problem with the motion model's prediction at `state`."""
         return self.with_prediction(self.predict(state))
 
     def with_motion_model(
         self, predict: Callable[..., Any], parameters: Any
     ) -> "Problem":
-        """The same problem with another motion model, which `solve` predicts with.
+        """Returns the problem with another motion model, with which `solve` predicts.
 
         `predict(parameters, body, orientation, body_pose, shape, present)` is called
         for one person: root rotations (t, 3, 3) to the world, joint rotations
@@ -191,10 +192,10 @@ class Problem(eqx.Module):
     def with_variables(
         self, state: State, **variables: Variable
     ) -> tuple["Problem", State]:
-        """The same problem and state with more named globals, which are free.
+        """Returns the problem and state with more named globals, which are free.
 
         Their priors are factors (`GlobalPrior`). Other factors that depend on them are
-        put in with `with_factors`.
+        added by `with_factors`.
 
         **Raises:** `ValueError` for a name that is taken or no identifier, a value that
         is not finite, or a sigma that is not above 0.
@@ -226,11 +227,11 @@ class Problem(eqx.Module):
         return problem.with_factors(*priors), state
 
     def named(self, values: Float[Array, "*b g"]) -> dict[str, Float[Array, "*b _"]]:
-        """Each named global of `State.globals`, by its name."""
+        """Returns each named global of `State.globals`, by its name."""
         return dict(split(self.globals, values))
 
     def with_factors(self, *factors: Factor) -> "Problem":
-        """The same problem with more factors; states of this problem fit it as before.
+        """Returns the problem with more factors; states of this problem fit it, too.
 
         Checks and layout are those of `make_problem`. Named globals of `factors` must
         be variables of the problem (`with_variables`). What is held stays held, except
@@ -266,7 +267,7 @@ class Problem(eqx.Module):
 
 
 def _with_prediction(factor: Factor, prediction: dict[str, Array]) -> Factor:
-    """The factor with its predicted measurements replaced, if it has any."""
+    """Returns the factor with its predicted measurements replaced, if it has any."""
     if isinstance(factor, Masked):
         inner = _with_prediction(factor.factor, prediction)
         return eqx.tree_at(lambda f: f.factor, factor, inner)
@@ -368,8 +369,8 @@ def make_problem(
 
 
 def _variables_of(factors: Sequence[Factor]) -> set[str]:
-    """Names of the variables (as in `Key`) that any `FrameFactor` depends on; the scale
-    of a prior that people are in, too."""
+    """Returns the names (as in `Key`) of the variables that any `FrameFactor` depends
+    on, with the scale if a `MarginalPrior` has people."""
     over_frames = [f for f in factors if isinstance(f, FrameFactor)]
     known = {name for factor in over_frames for name, _ in factor.touched}
     priors = [f for f in factors if isinstance(f, MarginalPrior)]
@@ -380,7 +381,7 @@ def _variables_of(factors: Sequence[Factor]) -> set[str]:
 def layout_of(
     factors: Sequence[Factor], sizes: Sizes, common_sizes: bool | None
 ) -> Layout:
-    """The layout of landmark observations in dense blocks, see `graph/layout.py`.
+    """Returns the layout of landmark observations in dense tables (`graph/layout.py`).
 
     **Raises:** `ValueError` for two `Reprojection` or `MarginalPrior`, and for priors
     of landmarks without an observation.
@@ -406,7 +407,7 @@ def layout_of(
 
 
 def _sample_state(free: Step) -> State:
-    """An arbitrary valid state with the array shapes and dtype of `free`, for checks.
+    """Returns an arbitrary valid state with the shapes and dtype of `free`, for checks.
 
     All cameras are at the origin; people and landmarks are 3 m in front of them.
     """

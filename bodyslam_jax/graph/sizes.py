@@ -16,38 +16,38 @@ from bodyslam_jax.graph.ordering import CHUNK
 
 
 class Size(NamedTuple):
-    """What one program can hold."""
+    """The sizes of a problem that one compiled program can hold."""
 
     chunks: int
     landmarks: int
     observations: int
     widths: tuple[int, ...]
-    """Chunks that narrow and wide tables span: the longest track."""
+    """Numbers of chunks that narrow and wide tables span: the longest track."""
     groups: tuple[int, ...]
-    """Groups of landmarks in narrow and wide tables."""
+    """Numbers of groups of landmarks in narrow and wide tables."""
 
 
-LANDMARKS = 128
-"""Landmarks for each chunk of ten frames."""
-OBSERVATIONS = 2304
-"""Observations for each chunk: the front end tracks 200 points at any time."""
-NARROW, WIDE = 3, 10
-"""Chunks that a table spans. The landmarks of the joint graph span 90 frames at most
-(`Structure.landmark_span`), which are in 10 chunks."""
-LONGEST = 20
-"""Chunks that a wide table spans where tracks are longer, as in bundle adjustment."""
-_MOST = 40
-"""Chunks up to which there is a size for longer tracks: their covariances take memory
+CHUNK_LANDMARKS = 128
+"""Number of landmarks for each chunk of ten frames."""
+CHUNK_OBSERVATIONS = 2304
+"""Number of observations for each chunk; the front end tracks 200 points."""
+NARROW_CHUNKS, WIDE_CHUNKS = 3, 10
+"""Number of chunks that a table spans. The landmarks of the joint graph span 90 frames
+at most (`Structure.landmark_span`), which are in 10 chunks."""
+LONG_TRACK_CHUNKS = 20
+"""Number of chunks that a wide table spans for long tracks (bundle adjustment)."""
+_MAX_LONG_TRACK_CHUNKS = 40
+"""Largest number of chunks with a size for longer tracks: their covariances take memory
 in proportion to the number of chunks and the square of the bandwidth."""
-_LONG, _DENSE = 200, 6.4
+_MIN_DENSE_FRAMES, _MIN_LANDMARKS_PER_FRAME = 200, 6.4
 """Number of frames, and landmarks for each, from which on a problem without people
 saves more in three solves with sizes of its own than their compilation takes."""
 
 
 def is_dense(num_frames: int, num_landmarks: int, num_people: int) -> bool:
-    """Whether a problem is faster, by its compilation too, in sizes of its own."""
-    many = num_landmarks > _DENSE * num_frames
-    return num_people == 0 and num_frames >= _LONG and many
+    """Returns True if sizes of its own are faster, compilation included."""
+    many = num_landmarks > _MIN_LANDMARKS_PER_FRAME * num_frames
+    return num_people == 0 and num_frames >= _MIN_DENSE_FRAMES and many
 
 
 def _size(chunks: int, narrow: int, wide: int) -> Size:
@@ -55,18 +55,25 @@ def _size(chunks: int, narrow: int, wide: int) -> Size:
     of_narrow, of_wide = 4 * chunks + 4, -(-12 * chunks // wide) + 4
     return Size(
         chunks=chunks,
-        landmarks=LANDMARKS * chunks,
-        observations=OBSERVATIONS * chunks,
+        landmarks=CHUNK_LANDMARKS * chunks,
+        observations=CHUNK_OBSERVATIONS * chunks,
         widths=(narrow, wide) if narrow < wide else (wide,),
         groups=(of_narrow, of_wide) if narrow < wide else (of_narrow + of_wide,),
     )
 
 
-_CHUNKS = tuple(length // CHUNK for length in LENGTHS)
+_CHUNK_COUNTS = tuple(length // CHUNK for length in LENGTHS)
 SIZES = tuple(
     sorted(
-        {_size(n, NARROW, WIDE if n > WIDE + 2 else n) for n in _CHUNKS}
-        | {_size(n, NARROW + 1, LONGEST) for n in _CHUNKS if WIDE + 2 < n <= _MOST}
+        {
+            _size(n, NARROW_CHUNKS, WIDE_CHUNKS if n > WIDE_CHUNKS + 2 else n)
+            for n in _CHUNK_COUNTS
+        }
+        | {
+            _size(n, NARROW_CHUNKS + 1, LONG_TRACK_CHUNKS)
+            for n in _CHUNK_COUNTS
+            if WIDE_CHUNKS + 2 < n <= _MAX_LONG_TRACK_CHUNKS
+        }
     )
 )
-"""In the order in which they are tried."""
+"""All sizes, in the order in which they are tried."""

@@ -1,4 +1,4 @@
-"""The state: all variables of the graph, and how a step moves them.
+"""The state: all variables of the graph, their tangent space and retraction.
 
 Cameras carry the paper's scale over-parameterisation (Section 3.6): `r_WC = s r'_WC`
 with a linear `s`. People are anchored in the camera (`T_CH`, not `T_WH`), so that the
@@ -16,9 +16,9 @@ from bodyslam_jax.geometry import so3
 from bodyslam_jax.geometry.lengths import lengthened, padded_length, shortened
 
 TURNS = 69
-"""Turns of the 23 joints of a posture, three each."""
-_MOVED = 0.01
-"""rad, m and so on: standard deviation of a step to a state close by."""
+"""Number of coordinates of the turns of a posture's 23 joints, three each."""
+_PERTURBATION_SIGMA = 0.01
+"""Standard deviation of a random step, in the unit of each coordinate."""
 
 
 class Step(eqx.Module):
@@ -87,8 +87,8 @@ class State(eqx.Module):
         )
 
     def local(self, other: "State") -> Step:
-        """The step that leads to `other`: the inverse of `retract`. Rotations by less
-        than half a turn."""
+        """Returns the step to `other`, the inverse of `retract`, for rotations by
+        less than half a turn."""
         poses = jnp.concatenate([self.cameras[None], self.roots])
         others = jnp.concatenate([other.cameras[None], other.roots])
         steps = local_pose(poses, others)
@@ -104,7 +104,7 @@ class State(eqx.Module):
         )
 
     def zero_step(self) -> Step:
-        """The zero step."""
+        """Returns the step that is 0 in all coordinates."""
         return Step(
             scale=jnp.zeros_like(self.scale),
             cameras=jnp.zeros_like(self.cameras, shape=(*self.cameras.shape[:-2], 6)),
@@ -118,14 +118,14 @@ class State(eqx.Module):
 
 
 def _no_globals(scale: Any) -> Float[Array, " 0"]:
-    """An empty vector of the precision of `scale`."""
+    """Returns an empty vector of the precision of `scale`."""
     return jnp.zeros((0,), getattr(scale, "dtype", None))
 
 
 def retract_pose(
     pose: Float[Array, "*b 4 4"], step: Float[Array, "*b 6"]
 ) -> Float[Array, "*b 4 4"]:
-    """`C Exp(step[:3])` and `r + step[3:]`."""
+    """Returns the pose with `C Exp(step[:3])` and `r + step[3:]`."""
     turn = so3.exp(step[..., :3])
     top = jnp.concatenate(
         [
@@ -140,7 +140,7 @@ def retract_pose(
 def local_pose(
     pose: Float[Array, "*b 4 4"], other: Float[Array, "*b 4 4"]
 ) -> Float[Array, "*b 6"]:
-    """The step that leads from one pose to another: the inverse of `retract_pose`."""
+    """Returns the step from one pose to another, the inverse of `retract_pose`."""
     turn = so3.log(so3.inverse(pose[..., :3, :3]) @ other[..., :3, :3])
     return jnp.concatenate([turn, other[..., :3, 3] - pose[..., :3, 3]], axis=-1)
 
@@ -148,7 +148,7 @@ def local_pose(
 def retract_rotation(
     rotation: Float[Array, "*b 3"], step: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3"]:
-    """`Log(Exp(rotation) Exp(step))`, continuous in `step` around every angle up to pi.
+    """Returns `Log(Exp(rotation) Exp(step))`, continuous in `step` for angles up to pi.
 
     For vectors longer than 2 rad the branch of the logarithm is that of `rotation`, so
     an axis-angle vector may leave the ball of radius pi without a jump. Beyond 2 pi - 2
@@ -163,24 +163,24 @@ def retract_rotation(
 
 
 def world_from_root(state: State) -> Float[Array, "h t 4 4"]:
-    """T_WH in metres: `r_WH = s r'_WC + C_WC r_CH`, `C_WH = C_WC C_CH`."""
+    """Returns T_WH in metres: `r_WH = s r'_WC + C_WC r_CH`, `C_WH = C_WC C_CH`."""
     cameras = state.cameras.at[:, :3, 3].multiply(state.scale)
     return cameras @ state.roots
 
 
 @jax.jit
 def moved_at_random(state: State) -> State:
-    """Another state close by, drawn with a fixed key: there a residual or a derivative
-    is not 0 by chance."""
+    """Returns a state close by, drawn with a fixed key, at which no residual or
+    derivative is 0 by chance."""
     leaves, treedef = jax.tree.flatten(state.zero_step())
     keys = jax.random.split(jax.random.key(0), len(leaves))
-    draw = lambda key, x: _MOVED * jax.random.normal(key, x.shape, x.dtype)
+    draw = lambda key, x: _PERTURBATION_SIGMA * jax.random.normal(key, x.shape, x.dtype)
     step = [draw(k, x) for k, x in zip(keys, leaves, strict=True)]
     return state.retract(treedef.unflatten(step))
 
 
 def gauge(cameras: Float[Array, "t 4 4"]) -> Float[Array, "t 6"]:
-    """1 where a camera coordinate is free, 0 where it is held to fix the gauge.
+    """Returns 1 where a camera coordinate is free, 0 where it is held to fix the gauge.
 
     The world's origin and axes are the first camera; the unit of the map is one
     coordinate, the largest, of the camera that is farthest from it. Seven numbers are

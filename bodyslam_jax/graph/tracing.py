@@ -1,4 +1,4 @@
-"""Tells calls that run at once from those traced in a `jit`, `vmap` or `grad`."""
+"""Tells concrete calls from those traced in a `jit`, `vmap` or `grad`."""
 
 from typing import Any
 
@@ -8,10 +8,10 @@ import jax.numpy as jnp
 
 
 def is_alone() -> bool:
-    """Whether the current call is not being traced in a larger `jit`."""
+    """Returns True if the current call is not being traced in a larger `jit`."""
     return not isinstance(jnp.zeros(()) + 1, jax.core.Tracer)
 
 
 def is_traced(tree: Any) -> bool:
-    """Whether any array of a tree is a tracer: mapped, differentiated or compiled."""
+    """Returns True if any array of a tree is a tracer (`jit`, `vmap`, `grad`)."""
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))

@@ -34,12 +34,12 @@ from bodyslam_jax.graph.validation_weights import (
 )
 
 Sizes = dict[str, int]
-"""Lengths of named axes."""
+"""Lengths of the axes that annotations name."""
 
-_ROTATION = 1e-3
+_MAX_ROTATION_ERROR = 1e-3
 """Largest allowed entry of `|C^T C - I|`: files have few digits, and rotations drift in
 single precision."""
-_KINDS: dict[Any, tuple[Any, str]] = {
+_DTYPE_KINDS: dict[Any, tuple[Any, str]] = {
     Float: (jnp.floating, "floating point"),
     Int: (jnp.integer, "integers"),
     Bool: (jnp.bool_, "bool"),
@@ -133,7 +133,7 @@ def check_shapes(module: eqx.Module, name: str, sizes: Sizes) -> None:
         where = f"{name}.{field}"
         if not isinstance(found, jax.Array | np.ndarray):
             raise ValueError(f"{where}: found {found!r:.40}, expected an array.")
-        numbers, word = _KINDS.get(kind.dtype, (jnp.generic, "numbers"))
+        numbers, word = _DTYPE_KINDS.get(kind.dtype, (jnp.generic, "numbers"))
         if not jnp.issubdtype(found.dtype, numbers):
             raise ValueError(f"{where}: found {found.dtype}, expected {word}.")
         axes = kind.dim_str.split()
@@ -209,7 +209,7 @@ def _check_values(module, name):
 
 
 def _check_precision(state, free):
-    """All arrays of a state must be of one floating-point dtype, that of the problem.
+    """Refuses a state whose arrays are not all of one dtype, that of the problem.
 
     Otherwise a `lax` loop over states would change the dtype of its carry.
     """
@@ -226,7 +226,7 @@ def _check_precision(state, free):
 
 
 def _measured(sigma):
-    """Mask of the measurements with at least one finite `sigma` on the last axis.
+    """Returns which measurements have at least one finite `sigma` on the last axis.
 
     All false if `sigma` is traced: its values are not available then.
     """
@@ -248,7 +248,7 @@ def _check_rotations(poses, where, mask=None):
         error = np.maximum(error, abs(poses[..., 3, :] - np.eye(4)[3]).max(axis=-1))
     if mask is not None:
         error = np.where(mask, error, 0)
-    wrong = error > _ROTATION
+    wrong = error > _MAX_ROTATION_ERROR
     if wrong.any():
         at = tuple(int(i) for i in np.argwhere(wrong)[0])
         what = "poses" if poses.shape[-1] == 4 else "rotations"
@@ -262,7 +262,7 @@ def _check_unit(direction, where):
     if is_traced(direction):
         return
     length = np.linalg.norm(np.asarray(direction, float))
-    if abs(length - 1) > _ROTATION:
+    if abs(length - 1) > _MAX_ROTATION_ERROR:
         raise ValueError(f"{where}: a direction of length {length:.4g}, expected 1.")
 
 
@@ -306,7 +306,7 @@ def _check_tracks(factor, sizes):
 
 
 def check_basis(basis: Array | np.ndarray, dtype: np.dtype) -> Array:
-    """The basis of postures in the precision of a state.
+    """Returns the basis of postures in the precision of a state.
 
     **Raises:** `ValueError` unless it has 69 rows and orthonormal columns.
     """

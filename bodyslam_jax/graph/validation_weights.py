@@ -100,7 +100,7 @@ def check_first_frames(factor: Factor, name: str) -> None:
     """
     for kind, field, count, empty in _FIRST_FRAMES:
         value = getattr(factor, field, None)
-        # Not of subclasses, whose residuals may depend on other frames.
+        # Subclasses are not checked: their residuals may depend on other frames.
         if type(factor) is not kind or is_traced(value):
             continue
         values = np.asarray(value)

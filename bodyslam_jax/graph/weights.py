@@ -1,4 +1,4 @@
-"""The weights λ of a problem's terms: read, and replaced without a new compilation.
+"""Reads the weights λ of a problem's terms, and replaces them without recompilation.
 
 The paper writes its cost as `Σ λ ρ(e²)` (section 3.6). A factor holds the standard
 deviation of each measurement instead, so `λ = σ⁻²`, averaged over the measurements of
@@ -18,7 +18,7 @@ from bodyslam_jax.graph.padding import Masked
 from bodyslam_jax.graph.problem import Problem
 from bodyslam_jax.graph.tracing import is_traced
 
-_NAMES = {
+_TERM_NAMES = {
     "Reprojection": "landmarks",
     "KeypointReprojection": "keypoints",
     "GroundContact": "ground",
@@ -28,14 +28,13 @@ _NAMES = {
 
 
 def weights(problem: Problem) -> dict[str, Float[Array, ""]]:
-    """λ of each term, the mean inverse variance of its measurements.
+    """Returns λ of each term, the mean inverse variance of its measurements.
 
     Terms are named after the factor's class without `Prior`, in lower case:
     `human_motion`, `body_pose`, `shape`, `stature`, ...; `landmarks` and `keypoints`
     are the two reprojection terms. Units are those of σ⁻²: px⁻², rad⁻², m⁻² or leg
-    lengths⁻². A term of which all
-    measurements are missing has 0; factors without a field `sigma` or `whitening` have
-    no λ here.
+    lengths⁻². A term whose measurements are all missing has 0; factors without a field
+    `sigma` or `whitening` have no λ here.
     """
     found = {}
     for name, factor in zip(term_names(problem), problem.factors, strict=True):
@@ -49,12 +48,12 @@ def weights(problem: Problem) -> dict[str, Float[Array, ""]]:
 def with_weights(
     problem: Problem, **weights: float | Float[Array, ""] | np.ndarray
 ) -> Problem:
-    """The same problem with other λ: the cost of a term is λ times its robust loss.
+    """Returns the problem with other λ: the cost of a term is λ times its robust loss.
 
     Standard deviations of a term are multiplied by one factor, and the scale of its
     robust loss with them, so that the same pixels or metres are an outlier. Shapes and
-    compiled programs stay the same for all values. Differentiates by, and maps over, λ;
-    λ = 0 is not allowed (`graph.disable` leaves a term out).
+    compiled programs stay the same for all values. The result can be differentiated by,
+    and mapped over, λ; λ = 0 is not allowed (`graph.disable` leaves a term out).
 
     **Raises:** `ValueError` for a term that the problem does not have, or a λ that is
     not positive and finite.
@@ -71,26 +70,26 @@ def with_weights(
 
 
 def term_names(problem: Problem) -> list[str]:
-    """The name of each factor's term, numbered where a class repeats."""
+    """Returns the name of each factor's term, numbered where a class repeats."""
     return [_snake_case(name) for name in problem.names]
 
 
 def _snake_case(name: str) -> str:
     kind, _, number = name.partition("_")
     words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.removesuffix("Prior")).lower()
-    words = _NAMES.get(kind, words)
+    words = _TERM_NAMES.get(kind, words)
     return f"{words}_{number}" if number else words
 
 
 def _mean_inverse_variance(factor: Factor) -> Float[Array, ""] | None:
-    """`None` where the factor has no standard deviation; 0 where all are missing."""
+    """Returns λ, 0 if all is missing; `None` without a standard deviation."""
     sigma, whitening = _field(factor, "sigma"), _field(factor, "whitening")
     if whitening is not None:
         variances = jnp.sum(whitening**2, axis=(-1, -2)) / whitening.shape[-1]
         present = variances > 0
     elif sigma is not None:
         present = jnp.isfinite(sigma)
-        # Infinite means missing; its derivative is not a number.
+        # An infinite sigma is missing, and its derivative would be NaN.
         variances = jnp.where(present, 1 / jnp.where(present, sigma, 1.0) ** 2, 0.0)
     else:
         return None
@@ -108,7 +107,7 @@ def _weighted(name: str, factor: Factor, value: Any) -> Factor:
             f"weights.{name}: {type(factor).__name__} has no field `sigma` or "
             "`whitening`, expected one of them."
         )
-    # Where nothing is measured, nothing changes.
+    # A term without measurements stays as it is.
     empty = before == 0
     ratio = jnp.asarray(value, before.dtype) / jnp.where(empty, 1.0, before)
     root = jnp.sqrt(jnp.where(empty, 1.0, ratio))
@@ -128,7 +127,7 @@ def _weighted(name: str, factor: Factor, value: Any) -> Factor:
 
 
 def _field(factor: Factor, name: str) -> Any:
-    """An array of a factor, `None` if it has none of this name."""
+    """Returns an array of a factor, `None` if it has none of this name."""
     value = getattr(factor, name, None)
     return value if eqx.is_array(value) else None
 

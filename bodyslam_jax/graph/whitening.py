@@ -1,4 +1,4 @@
-"""Whitening: by a covariance, and of AR(1) errors."""
+"""Whitening of residuals by a covariance, and of AR(1) errors."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ def innovation(
     previous: Float[Array, "*n"],
     correlation: Float[Array, "*#n"],
 ) -> Float[Array, "*n"]:
-    """The innovation of an AR(1) error, `(e_k - ρ e_{k-1}) / sqrt(1 - ρ²)`.
+    """Returns the innovation of an AR(1) error, `(e_k - ρ e_{k-1}) / sqrt(1 - ρ²)`.
 
     It has the stationary variance of the error and is independent of earlier
     innovations. With ρ = 0, at the start of a run, it is the error itself.
@@ -22,7 +22,7 @@ def innovation(
 def ar1_correlation(
     present: Bool[Array, "h t"], correlation: float | Float[Array, ""]
 ) -> Float[Array, "h t"]:
-    """ρ where this frame and the one before are measured, 0 at the start of a run."""
+    """Returns ρ where this frame and the one before are measured, else 0."""
     before = jnp.concatenate([jnp.zeros_like(present[:, :1]), present[:, :-1]], axis=1)
     return jnp.where(present & before, correlation, 0.0)
 
@@ -30,7 +30,7 @@ def ar1_correlation(
 def whitening_of(
     covariance: Float[Array, "*b 3 3"], valid: Bool[Array, "*b"]
 ) -> Float[Array, "*b 3 3"]:
-    """`W` with `W^T W` the inverse of the covariance; 0 where not valid."""
+    """Returns `W` with `W^T W` the inverse of the covariance; 0 where not valid."""
     eye = jnp.eye(3, dtype=covariance.dtype)
     safe = jnp.where(valid[..., None, None], covariance, eye)
     lower = jnp.linalg.cholesky(safe)

@@ -1,8 +1,8 @@
 """A small bundle adjustment in NumPy, for the front end alone.
 
-Reprojection errors of points in undistorted images, a Cauchy loss, Levenberg--Marquardt
-with the points eliminated (Schur complement). It serves incremental mapping only;
-the final estimate is that of the factor graph.
+It minimises reprojection errors in undistorted images under a Cauchy loss, by
+Levenberg--Marquardt with the points eliminated (Schur complement). It serves
+incremental mapping only; the final estimate is that of the factor graph.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from bodyslam_jax.geometry.grouped_sums import sum_by
 
 @dataclasses.dataclass
 class Scene:
-    """Cameras and points, up to scale; unlike elsewhere, changed in place."""
+    """Cameras and points, up to scale; unlike other states, it is changed in place."""
 
     R_CW: Float[np.ndarray, "t 3 3"]
     centre: Float[np.ndarray, "t 3"]
@@ -39,26 +39,29 @@ class Views:
 
 
 ERROR_PER_SIGMA = 1.18
-"""Median length of a vector of two normal errors, in their standard deviation."""
-_NEAR = 1e-6
-_DAMPING, _LEAST = 1e-8, 1e-13
+"""Median length of a vector of two normal errors, in units of their sigma."""
+_MIN_DEPTH = 1e-6
+"""Depth, in units of the map, below which a point is behind the camera."""
+_INITIAL_DAMPING, _MIN_DAMPING = 1e-8, 1e-13
 """Initial and least damping, relative to the diagonal: the smallest eigenvalue of a
 long path is some 1e-10 of that of a single camera."""
 
 
 def errors(scene: Scene, views: Views) -> Float[np.ndarray, " m"]:
-    """Reprojection errors at depth 1 (times the focal length: px); inf if behind."""
+    """Returns reprojection errors at depth 1 (times the focal length: px); `inf` for
+    points behind the camera."""
     p_C = _in_camera(scene, views)
     z = p_C[:, 2]
-    safe = np.where(z > _NEAR, z, 1.0)
+    safe = np.where(z > _MIN_DEPTH, z, 1.0)
     error = np.linalg.norm(p_C[:, :2] / safe[:, None] - views.xy, axis=-1)
-    return np.where(z > _NEAR, error, np.inf)
+    return np.where(z > _MIN_DEPTH, error, np.inf)
 
 
 def jacobian_of_points(scene: Scene, views: Views) -> Float[np.ndarray, "m 2 3"]:
-    """Derivative of each observation by its point; 0 for a point behind the camera."""
+    """Returns the derivative of each observation by its point; 0 for a point behind the
+    camera."""
     p_C = _in_camera(scene, views)
-    z = np.where(p_C[:, 2] > _NEAR, p_C[:, 2], np.inf)[:, None, None]
+    z = np.where(p_C[:, 2] > _MIN_DEPTH, p_C[:, 2], np.inf)[:, None, None]
     xy = np.where(np.isfinite(z[:, 0]), p_C[:, :2] / z[:, 0], 0.0)
     R = scene.R_CW[views.frame]
     return (R[:, :2] - xy[:, :, None] * R[:, 2:]) / z
@@ -77,7 +80,7 @@ def adjust(
 
     Args:
         loss: scale of the Cauchy loss, in units of depth-1 coordinates.
-        tolerance: stops when the cost falls by less than this part.
+        tolerance: relative decrease of the cost below which it stops.
 
     Returns: the cost, in squared `loss`.
     """
@@ -86,7 +89,7 @@ def adjust(
     camera_of = np.full(len(free), -1)
     camera_of[cameras] = np.arange(len(cameras))
     camera_of = camera_of[views.frame]
-    damping, cost = _DAMPING, _cost(scene, views, loss)
+    damping, cost = _INITIAL_DAMPING, _cost(scene, views, loss)
     for _ in range(iterations):
         system = _linearise(scene, views, camera_of, point_of, loss, len(cameras))
         better = None
@@ -101,13 +104,13 @@ def adjust(
                 better = trial, new
                 break
             if new < (1 + tolerance) * cost:
-                break  # as good as it gets, up to rounding
+                break  # converged, up to rounding
             damping *= 100
         if better is None:
             break
         trial, new = better
         scene.R_CW, scene.centre, scene.points = trial.R_CW, trial.centre, trial.points
-        damping = max(damping / 10, _LEAST)
+        damping = max(damping / 10, _MIN_DAMPING)
         done = cost - new < tolerance * cost
         cost = new
         if done:
@@ -121,7 +124,7 @@ def _in_camera(scene: Scene, views: Views) -> np.ndarray:
 
 
 def _cost(scene: Scene, views: Views, loss: float) -> float:
-    # Behind the camera counts as a large, bounded error: the loss must stay finite.
+    # A point behind the camera has a large, bounded error: the loss must stay finite.
     error = np.minimum(errors(scene, views), 10.0) / loss
     return float(np.log1p(error**2).sum())
 
@@ -134,9 +137,9 @@ def _linearise(
     loss: float,
     num_cameras: int,
 ) -> tuple[np.ndarray, ...]:
-    """Normal equations in blocks: cameras, points, and between them."""
+    """Returns the normal equations in blocks: cameras, points, and between them."""
     p_C = _in_camera(scene, views)
-    front = p_C[:, 2] > _NEAR
+    front = p_C[:, 2] > _MIN_DEPTH
     z = np.where(front, p_C[:, 2], 1.0)
     xy = p_C[:, :2] / z[:, None]
     r = (xy - views.xy) / loss
@@ -169,7 +172,7 @@ def _linearise(
 def _solve(
     system: tuple[np.ndarray, ...], damping: float, num_points: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Step of the cameras (k, 6) and points (l, 3), or None if singular."""
+    """Returns the step of cameras (k, 6) and points (l, 3), or None if singular."""
     U, b_c, V, b_p, W, camera, point = system
     eye3, eye6 = np.eye(3), np.eye(6)
     V = V * (1 + damping * eye3) + 1e-9 * np.trace(V, axis1=1, axis2=2).mean() * eye3

@@ -1,4 +1,4 @@
-"""Overlays: tracks that stay at one pixel and are not part of the scene.
+"""Detects overlays: tracks that stay at one pixel and are not part of the scene.
 
 Text, logos and displays burnt into a video, dirt on the lens, and parts of the vehicle
 or hand that carries the camera give long tracks with strong contrast. A scene point may
@@ -21,36 +21,39 @@ from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.multiview import fit_rotation
 from bodyslam_jax.types import Intrinsics, Tracks
 
-STILL = 0.5
-"""Displacement up to which a point counts as still, px: assumes tracking noise
+MAX_STILL_DISPLACEMENT_PX = 0.5
+"""Largest displacement of a point that counts as still, px: assumes tracking noise
 below 0.2 px (1 σ) and is scaled with larger images; 2.5 σ of noisier tracks instead."""
-_GAPS = (6, 15, 30, 60)
-"""Frames between the two of a pair."""
-_MOST_ANCHORS = 300
-_TIMES_STILL = 4.0
-"""Ratio of the displacement of moving to that of still points from which the two can be
-separated."""
-_FEWEST_MOVERS = 15
-_FEWEST_INCONSISTENT = 2
-_FEWEST_TELLING = (3, 0.1)
+_PAIR_GAPS_FRAMES = (6, 15, 30, 60)
+"""Distances, in frames, of the two frames of a pair."""
+_MAX_ANCHORS = 300
+"""Largest number of first frames of pairs."""
+_MIN_MOVING_RATIO = 4.0
+"""Least ratio of the median displacement of moving points to the limit of still ones,
+at which the two can be separated."""
+_MIN_MOVING_POINTS = 15
+_MIN_INCONSISTENT_PAIRS = 2
+_MIN_INFORMATIVE_PAIRS = (3, 0.1)
 """Least number of pairs in which a scene moves beside still points, and their share of
 the pairs with still points: fewer may be an object that crosses before a static
 camera."""
-_SHARE_INCONSISTENT = 0.4
-"""Share of a still point's pairs that must contradict: scene points nearly always
-fit."""
-_FEWEST_ALWAYS, _MEAN_ALWAYS = 6, 0.7
-"""Pairs of a point, and its mean distance in the same unit, that contradict as well."""
-_TOLERANCE = 3.0
-"""Distance from what the motion of the others allows, of their own robust scatter and
-of `STILL`, from which a point contradicts it."""
-_CELLS = 8
-"""Along the longer side: the motion of the camera is seen all over the image."""
-_LEAST_COVER, _LEAST_ROWS = 1.0, 3
-"""Least ratio of moving to still cells, and least rows and columns of moving cells:
-less may be traffic before a static camera."""
-_AROUND = 15
-"""Frames before and after a burnt-in point in which its place is masked."""
+_MIN_INCONSISTENT_SHARE = 0.4
+"""Least share of a still point's pairs that must contradict the motion; scene points
+nearly always fit."""
+_MIN_MEAN_PAIRS, _MIN_MEAN_DISTANCE = 6, 0.7
+"""Least number of pairs, and least mean distance in the unit of `_MAX_MODEL_DISTANCE`,
+at which a point is classified as burnt in as well."""
+_MAX_MODEL_DISTANCE = 3.0
+"""Distance from the motion model of the others, in units of their robust scatter or, if
+larger, the limit of still points, beyond which a point contradicts the model."""
+_NUM_CELLS = 8
+"""Number of cells along the image's longer side. Camera motion
+is visible all over it."""
+_MIN_COVER_RATIO, _MIN_COVER_ROWS = 1.0, 3
+"""Least ratio of moving to still cells, and least number of rows and columns of moving
+cells: less may be traffic before a static camera."""
+_MASKED_FRAMES = 15
+"""Number of frames before and after a burnt-in point in which its place is masked."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +64,7 @@ class BurntIn:
     still: Bool[np.ndarray, " l"]
     """Tracks that stay at their pixel, of the scene or not."""
     num_pairs: int
-    """Pairs of frames with enough motion for the test."""
+    """Number of pairs of frames with enough motion for the test."""
 
     @property
     def found(self) -> bool:
@@ -69,10 +72,10 @@ class BurntIn:
 
 
 def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> BurntIn:
-    """Which tracks stay at their pixel against the motion of all others.
+    """Classifies tracks that stay at their pixel against the motion of all others.
 
-    The displacement that counts as none is `STILL` px (more in larger images), or what
-    the tracks' own noise makes of a point at rest, if that is more.
+    A point counts as still up to `still_limit` px, or 2.5 standard deviations of the
+    tracks' noise, if that is more.
     """
     num = int(tracks.landmark.max()) + 1 if len(tracks.landmark) else 0
     tested, against = np.zeros(num, np.int64), np.zeros(num, np.int64)
@@ -91,9 +94,9 @@ def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> Bu
         stays[ids[still]] += 1
         resting += int(still.any())
         movers = moved > 2 * limit
-        if not still.any() or movers.sum() < _FEWEST_MOVERS:
+        if not still.any() or movers.sum() < _MIN_MOVING_POINTS:
             continue
-        if np.median(moved[movers]) < _TIMES_STILL * limit:
+        if np.median(moved[movers]) < _MIN_MOVING_RATIO * limit:
             continue
         away, fits = _contradiction(
             rays(at_a, K, distortion),
@@ -105,14 +108,18 @@ def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> Bu
             continue
         telling += 1
         tested[ids[still]] += 1
-        against[ids[still]] += away[still] > _TOLERANCE
-        total[ids[still]] += np.minimum(away[still], _TOLERANCE)
-    often = against >= np.maximum(_FEWEST_INCONSISTENT, _SHARE_INCONSISTENT * tested)
-    # Or by less in nearly all pairs: a hand-held camera may rotate by little only.
-    always = (tested >= _FEWEST_ALWAYS) & (total > _MEAN_ALWAYS * tested)
+        against[ids[still]] += away[still] > _MAX_MODEL_DISTANCE
+        total[ids[still]] += np.minimum(away[still], _MAX_MODEL_DISTANCE)
+    often = against >= np.maximum(
+        _MIN_INCONSISTENT_PAIRS, _MIN_INCONSISTENT_SHARE * tested
+    )
+    # Or a smaller distance in nearly all pairs: a hand-held camera may rotate little.
+    always = (tested >= _MIN_MEAN_PAIRS) & (total > _MIN_MEAN_DISTANCE * tested)
     burnt = often | always
-    burnt &= telling >= max(_FEWEST_TELLING[0], _FEWEST_TELLING[1] * resting)
-    # Tracks that are still only for a while, as at occlusions, are kept.
+    burnt &= telling >= max(
+        _MIN_INFORMATIVE_PAIRS[0], _MIN_INFORMATIVE_PAIRS[1] * resting
+    )
+    # Tracks that are still for part of the time only, as at occlusions, are kept.
     burnt &= stays >= 0.5 * pairs
     return BurntIn(burnt, (stays >= 0.5 * pairs) & (pairs > 0), telling)
 
@@ -120,7 +127,7 @@ def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> Bu
 def without_burnt_in(
     tracks: Tracks, intrinsics: Intrinsics, num_frames: int
 ) -> tuple[Tracks, float]:
-    """The tracks of the scene alone, and the share of the observations left out."""
+    """Returns the tracks of the scene, and the share of observations removed."""
     found = find_burnt_in(tracks, intrinsics, num_frames)
     if not found.found:
         return tracks, 0.0
@@ -143,13 +150,14 @@ def burnt_in_warning(share: float) -> str:
 
 
 def still_limit(size: tuple[int, int]) -> float:
-    """Displacement (px) up to which a point is still: KLT errs more in large images."""
-    return STILL * max(1.0, max(size) / 1280)
+    """Returns the largest displacement (px) of a still point, which grows with the
+    image as KLT's errors do."""
+    return MAX_STILL_DISPLACEMENT_PX * max(1.0, max(size) / 1280)
 
 
 def noise_of(tracks: Tracks) -> float:
-    """Standard deviation (px) of single observations: from second differences of the
-    steadier half of the tracks, so that the motion of the camera counts little."""
+    """Estimates the standard deviation (px) of an observation from second differences,
+    by their lower quartile, so that camera motion has little influence."""
     order = np.lexsort((tracks.frame, tracks.landmark))
     frame, landmark, uv = (x[order] for x in (tracks.frame, tracks.landmark, tracks.uv))
     in_row = (landmark[2:] == landmark[:-2]) & (frame[2:] == frame[:-2] + 2)
@@ -167,11 +175,12 @@ def masks_of(
     size: tuple[int, int],
     radius: int,
 ) -> Iterator[UInt8[np.ndarray, "y x"]]:
-    """Masks (255) around observations, also for a while before and after each.
+    """Yields masks (255) around observations, from `_MASKED_FRAMES` frames before to as
+    many after each.
 
     Args:
         size: width and height, px.
-        radius: px
+        radius: radius of the mask around a point, px.
     """
     # Nearby observations are merged: text persists while its tracks come and go.
     place = np.round(uv / max(1, radius // 3)).astype(np.int64)
@@ -184,7 +193,7 @@ def masks_of(
     )
     visible = np.zeros((count, num_frames), dtype=bool)
     visible[of, frame] = True
-    width = np.ones(2 * _AROUND + 1, dtype=np.uint8)[None]
+    width = np.ones(2 * _MASKED_FRAMES + 1, dtype=np.uint8)[None]
     shown = cv2.dilate(visible.astype(np.uint8), width) if count else visible
     for k in range(num_frames):
         mask = np.zeros((size[1], size[0]), dtype=np.uint8)
@@ -194,9 +203,9 @@ def masks_of(
 
 
 def _pairs(num_frames: int) -> Iterator[tuple[int, int]]:
-    step = max(3, -(-num_frames // _MOST_ANCHORS))
+    step = max(3, -(-num_frames // _MAX_ANCHORS))
     step = min(step, 10)
-    for gap in _GAPS:
+    for gap in _PAIR_GAPS_FRAMES:
         for a in range(0, num_frames - gap, step):
             yield a, a + gap
 
@@ -204,8 +213,8 @@ def _pairs(num_frames: int) -> Iterator[tuple[int, int]]:
 def _contradiction(
     xy_a: np.ndarray, xy_b: np.ndarray, movers: np.ndarray, limit: float
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """Distance of each pair from the motion model of the movers, in robust standard
-    deviations, and which movers are inliers of that model.
+    """Returns the distance of each pair from the motion model of the movers, in robust
+    standard deviations (`None` without a model), and which movers are its inliers.
 
     A rotation is tried first: under pure rotation the essential matrix is undetermined.
     """
@@ -234,7 +243,8 @@ def sampson(
     xy_a: Float[np.ndarray, "n 2"],
     xy_b: Float[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, " n"]:
-    """First-order distance of each pair from the epipolar constraint, at depth 1."""
+    """Returns the first-order distance of each pair from the epipolar constraint, at
+    depth 1."""
     one = np.ones((len(xy_a), 1))
     a, b = np.concatenate([xy_a, one], axis=-1), np.concatenate([xy_b, one], axis=-1)
     at_b, at_a = a @ E.T, b @ E
@@ -246,13 +256,13 @@ def sampson(
 def _covers(
     uv: np.ndarray, movers: np.ndarray, still: np.ndarray, size: tuple[int, int]
 ) -> bool:
-    """Whether what moves is spread over the image as a scene is."""
-    cell = max(size) / _CELLS
+    """Returns True if the moving points are spread over the image as a scene is."""
+    cell = max(size) / _NUM_CELLS
     cells = lambda rows: {tuple(c) for c in (uv[rows] // cell).astype(int).tolist()}
     moving, staying = cells(movers), cells(still)
-    if min(len({cell[i] for cell in moving}) for i in (0, 1)) < _LEAST_ROWS:
+    if min(len({cell[i] for cell in moving}) for i in (0, 1)) < _MIN_COVER_ROWS:
         return False
-    return len(moving) >= max(4, _LEAST_COVER * len(staying - moving))
+    return len(moving) >= max(4, _MIN_COVER_RATIO * len(staying - moving))
 
 
 def _by_frame(

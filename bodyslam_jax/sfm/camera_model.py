@@ -1,9 +1,9 @@
 """Intrinsics from the tracks: pixel aspect ratio, radial distortion and zoom.
 
-An ordinary camera has square pixels, little distortion and one focal length. A camera
-that deviates is used only if its posterior odds are high: prior odds, times the
-likelihood ratio by tracks that had no part in the fit (`sfm.lens`). Then the map must
-be no worse with it, and people no less plausible (`sfm.upright_people`).
+An ordinary camera has square pixels, little distortion and one focal length. A
+deviating camera model is used only if its posterior odds are high: prior odds, times
+the likelihood ratio by held-out tracks (`sfm.lens`). Then the map must be no worse with
+it, and people no less plausible (`sfm.upright_people`).
 """
 
 import dataclasses
@@ -16,51 +16,53 @@ from bodyslam_jax.config import Structure
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import ERROR_PER_SIGMA, Scene, Views, errors
 from bodyslam_jax.sfm.burnt_in import noise_of
-from bodyslam_jax.sfm.lens import OTHER_FOCAL, Lens, LensPrior, examine_lens
-from bodyslam_jax.sfm.sfm import TURNING_ERROR, Reconstruction, reconstruct
+from bodyslam_jax.sfm.lens import OTHER_FOCAL_MODEL, Lens, LensPrior, examine_lens
+from bodyslam_jax.sfm.sfm import MAX_ROTATION_ERROR_PX, Reconstruction, reconstruct
 from bodyslam_jax.sfm.upright_people import plausibility
-from bodyslam_jax.sfm.zoom import LEAST_ZOOM, tracks_without_zoom, turning_zoom
+from bodyslam_jax.sfm.zoom import MIN_LOG_ZOOM, tracks_without_zoom, turning_zoom
 from bodyslam_jax.types import Intrinsics, Keypoints, Tracks
 
 _log = logging.getLogger(__name__)
 
-DECISIVE = np.log(100.0)
-"""Logarithm of the posterior odds from which a deviation is used: with prior odds ten
+DECISIVE_LOG_ODDS = np.log(100.0)
+"""Logarithm of the posterior odds above which a deviation is used: with prior odds ten
 times smaller it would still be ten times as probable as an ordinary camera."""
-_ODDS = {"aspect": 1e-3, "radial": 1 / 20, "zoom": 1 / 50}
-"""Prior odds: pixels that are not square without a word of the container, distortion
-beyond |k1| 0.05, and a zoom, of videos at large."""
-_CALIBRATED_ODDS = {"focal": 1e-3, "aspect": 1e-3, "radial": 1e-3, "zoom": 1 / 50}
-"""The same of a video with a calibration: one in a thousand is of another lens. Another
-focal length is never used, as the calibration is held; `diagnostics.facts` tells it."""
-_ASPECT = (0.003, 0.25)
-"""Standard deviations of log(fx / fy): sensors have square pixels to some parts in a
-thousand, as calibrations show; a stretched video has one of the ratios of video
-standards (ITU-R BT.601 and 709: 0.91, 1.09, 1.21, 1.33, 1.46), which spread so far."""
-_RADIAL, _CALIBRATED_RADIAL = (0.02, 0.2), (0.01, 0.2)
-"""Of k1: an ordinary lens has at most 0.05 (2.5 standard deviations), one with a
-calibration is corrected to some parts in a hundred; action cameras and wide angles of
-phones have 0.1 to 0.35."""
-_ZOOM = (0.01, 0.4)
-"""Of the logarithm of the focal length over time: focus breathing changes it by a
-hundredth or two, a zoom by 1.1 to 2."""
-_CALIBRATED_FOCAL = 0.01
-"""Of the logarithm of a calibrated focal length."""
-_READOUT = 0.3
-"""Of the delay of a rolling shutter's last row, in frames: phones read an image in 5 to
-20 ms, a frame lasts 17 to 40 ms; it may also be none."""
-_OTHER_FOCALS = (0.63, 0.8, 1.25)
-"""Factors on a guessed focal length from which the ordinary camera is tried again: they
+_PRIOR_ODDS = {"aspect": 1e-3, "radial": 1 / 20, "zoom": 1 / 50}
+"""Prior odds, among all videos, of pixels that are not square although the container
+does not say so, of distortion beyond |k1| 0.05, and of a zoom."""
+_CALIBRATED_PRIOR_ODDS = {"focal": 1e-3, "aspect": 1e-3, "radial": 1e-3, "zoom": 1 / 50}
+"""Prior odds for a video with a calibration: one in a thousand is of another lens. A
+different focal length is never used, as the calibration is held, but reported by
+`diagnostics.facts`."""
+_ASPECT_SIGMAS = (0.003, 0.25)
+"""Standard deviations of log(fx / fy) of an ordinary camera and of a deviating one:
+sensors have square pixels to some parts in a thousand, as calibrations show; a
+stretched video has one of the ratios of video standards (ITU-R BT.601 and 709: 0.91,
+1.09, 1.21, 1.33, 1.46), whose spread this is."""
+_RADIAL_SIGMAS, _CALIBRATED_RADIAL_SIGMAS = (0.02, 0.2), (0.01, 0.2)
+"""Standard deviations of k1, likewise: an ordinary lens has at most 0.05 (2.5 standard
+deviations), one with a calibration is corrected to some parts in a hundred; action
+cameras and wide angles of phones have 0.1 to 0.35."""
+_ZOOM_SIGMAS = (0.01, 0.4)
+"""Standard deviations of the logarithm of the focal length over time, likewise: focus
+breathing changes it by a hundredth or two, a zoom by a factor of 1.1 to 2."""
+_CALIBRATED_FOCAL_SIGMA = 0.01
+"""Standard deviation of the logarithm of a calibrated focal length."""
+_READOUT_SIGMA_FRAMES = 0.3
+"""Standard deviation of the delay of a rolling shutter's last row, in frames: phones
+read an image in 5 to 20 ms, a frame lasts 17 to 40 ms; it may also be none."""
+_OTHER_FOCAL_FACTORS = (0.63, 0.8, 1.25)
+"""Factors on a guessed focal length with which the ordinary camera is tried again: they
 cover two standard deviations of the guess downwards, where wide lenses are, and one
 upwards."""
-_LEAST_SIGMA = 0.2
-"""Of an observation, px: trackers are no more exact."""
-_UNEXPLAINED = 9.21
-"""Cost of an observation that no point explains: the squared error, in variances, that
-99 % of observations stay below (chi-square of two degrees of freedom)."""
-_LESS_PLAUSIBLE = -1.0
-"""Logarithm of the likelihood ratio of people from which a camera makes them less
-plausible."""
+_MIN_SIGMA_PX = 0.2
+"""Least standard deviation of an observation, px: trackers are not more precise."""
+_UNEXPLAINED_COST = 9.21
+"""Cost of an unexplained observation: the squared error, in variances, that is exceeded
+by 1 % of observations (chi-square of two degrees of freedom)."""
+_MIN_PLAUSIBILITY_CHANGE = -1.0
+"""Logarithm of the likelihood ratio of people below which a camera model makes them
+less plausible."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +71,7 @@ class CameraModel:
 
     intrinsics: Intrinsics
     zoom: Float[np.ndarray, " t"] | None
-    """Logarithm of the focal length in each frame over that of `intrinsics`; None
+    """Logarithm of the ratio of each frame's focal length to that of `intrinsics`; None
     without a zoom."""
     tracks: Tracks
     """The tracks with the zoom undone."""
@@ -86,7 +88,8 @@ def find_camera_model(
     config: Structure,
     people: Keypoints | None = None,
 ) -> CameraModel:
-    """Corrects the given camera where the tracks and the people contradict it.
+    """Reconstructs the scene, with the given camera corrected where
+    the tracks contradict it.
 
     Pixel aspect ratio, one radial coefficient and a zoom are estimated if the camera
     translates; only a zoom if it rotates.
@@ -103,8 +106,8 @@ def find_camera_model(
     plain = tracks_without_zoom(tracks, zoom, centre) if zoom.any() else tracks
     found = reconstruct(plain, intrinsics, num_frames, config)
     if zoom.any() and found.kind == "moving":
-        # A turning zoom supposes a camera that does not translate, and forward motion
-        # scales images too: without a zoom the tracks must fit worse.
+        # `turning_zoom` assumes a camera that does not translate, but forward motion
+        # scales images, too: without a zoom the tracks must fit worse.
         unzoomed = reconstruct(tracks, intrinsics, num_frames, config)
         if _no_worse(unzoomed, found):
             zoom, plain, found = np.zeros(num_frames), tracks, unzoomed
@@ -112,7 +115,7 @@ def find_camera_model(
     lenses = _examine(plain, intrinsics, found, prior)
     lens = _most_probable(lenses)
     if lens is not None and lens.log_odds > 0 and intrinsics.is_guess:
-        # Another focal length may explain the tracks with an ordinary camera.
+        # An ordinary camera of another focal length may explain the tracks.
         better = _other_focal(plain, intrinsics, found, config)
         if better is not None:
             intrinsics, found = better
@@ -122,7 +125,7 @@ def find_camera_model(
     decisive = [
         other
         for other in lenses[1:]
-        if other.model != OTHER_FOCAL and is_decisive(other, lenses)
+        if other.model != OTHER_FOCAL_MODEL and is_decisive(other, lenses)
     ]
     before = plausibility(found, intrinsics, people, zoom) if decisive else 0.0
     for other in sorted(decisive, key=lambda other: -other.log_odds):
@@ -131,16 +134,19 @@ def find_camera_model(
         again = reconstruct(again_plain, camera, num_frames, config)
         if not _no_worse(again, found):
             why = "makes no better map"
-        elif plausibility(again, camera, people, trial) < before + _LESS_PLAUSIBLE:
+        elif (
+            plausibility(again, camera, people, trial)
+            < before + _MIN_PLAUSIBILITY_CHANGE
+        ):
             why = "makes people lean or change in size"
         else:
             zoom, plain, found, intrinsics = trial, again_plain, again, camera
             why = ""
             break
-    deviates = lens is not None and lens.model != OTHER_FOCAL
+    deviates = lens is not None and lens.model != OTHER_FOCAL_MODEL
     if lens is not None and deviates and lens.log_odds > 0 and why:
         warnings.append(_doubt(lens, intrinsics, why))
-    zooms = np.ptp(zoom) >= LEAST_ZOOM
+    zooms = np.ptp(zoom) >= MIN_LOG_ZOOM
     if zooms:
         warnings.insert(0, zoom_warning(zoom))
     elif zoom.any():
@@ -154,39 +160,39 @@ def find_camera_model(
 
 
 def prior_of(given: Intrinsics, config: Structure) -> LensPrior:
-    """What is known of a camera before its video was seen.
+    """Returns the prior on the lens of a camera.
 
-    A guess, a focal length that a user gave and a calibration differ in their standard
+    A guess, a focal length given by the user and a calibration differ in their standard
     deviations. If a calibration is of another camera, its focal length is a guess.
     """
     focal = config.focal_sigma
     if given.focal_sigma is not None:
         focal = min(given.focal_sigma / float(given.params[0]), focal)
     calibrated = not given.is_refined
-    odds = _CALIBRATED_ODDS if calibrated else _ODDS
+    odds = _CALIBRATED_PRIOR_ODDS if calibrated else _PRIOR_ODDS
     return LensPrior(
-        focal=(_CALIBRATED_FOCAL if calibrated else focal, focal),
-        aspect=_ASPECT,
-        radial=_CALIBRATED_RADIAL if calibrated else _RADIAL,
-        zoom=_ZOOM,
-        readout=_READOUT,
+        focal=(_CALIBRATED_FOCAL_SIGMA if calibrated else focal, focal),
+        aspect=_ASPECT_SIGMAS,
+        radial=_CALIBRATED_RADIAL_SIGMAS if calibrated else _RADIAL_SIGMAS,
+        zoom=_ZOOM_SIGMAS,
+        readout=_READOUT_SIGMA_FRAMES,
         runs=config.focal_runs,
         odds=tuple(odds.items()),
     )
 
 
 def is_decisive(lens: Lens, lenses: tuple[Lens, ...]) -> bool:
-    """Whether a model has decisive odds over all of `lenses` that it contains.
+    """Returns True if a model has decisive odds over all simpler `lenses` it contains.
 
-    Any deviation frees a calibrated focal length, and contains `OTHER_FOCAL`.
+    Any deviation frees a calibrated focal length, and contains `OTHER_FOCAL_MODEL`.
     """
-    contained = {*lens.model, *OTHER_FOCAL}
+    contained = {*lens.model, *OTHER_FOCAL_MODEL}
     simpler = [o for o in lenses if o is not lens and set(o.model) <= contained]
-    return all(lens.log_odds - other.log_odds > DECISIVE for other in simpler)
+    return all(lens.log_odds - other.log_odds > DECISIVE_LOG_ODDS for other in simpler)
 
 
 def _most_probable(lenses: tuple[Lens, ...]) -> Lens | None:
-    """The most probable deviation from the ordinary camera."""
+    """Returns the most probable deviation from the ordinary camera, if there is any."""
     for lens in lenses:
         _log.debug("lens: %s", lens)
     return max(lenses[1:], key=lambda lens: lens.log_odds, default=None)
@@ -195,21 +201,21 @@ def _most_probable(lenses: tuple[Lens, ...]) -> Lens | None:
 def _other_focal(
     tracks: Tracks, guess: Intrinsics, found: Reconstruction, config: Structure
 ) -> tuple[Intrinsics, Reconstruction] | None:
-    """A better map by an ordinary camera of another focal length, if there is one.
+    """Returns a better map by an ordinary camera of another focal length, or `None`.
 
     Its posterior odds over the guess must be decisive: where depth and focal length
     trade off, as before a wall, maps of all focal lengths differ by noise alone.
     """
     focal_sigma = prior_of(guess, config).focal[0]
-    best, least = None, DECISIVE
-    for factor in _OTHER_FOCALS:
+    best, least = None, DECISIVE_LOG_ODDS
+    for factor in _OTHER_FOCAL_FACTORS:
         params = np.asarray(guess.params, float).copy()
         params[:2] *= factor
         camera = dataclasses.replace(guess, params=params)
         again = reconstruct(tracks, camera, len(found.registered), config)
         if not _locates_as_many(again, found):
             continue
-        sigma = max(again.error / ERROR_PER_SIGMA, _LEAST_SIGMA)
+        sigma = max(again.error / ERROR_PER_SIGMA, _MIN_SIGMA_PX)
         gain = _misfit(tracks, guess, found, sigma)
         gain -= _misfit(tracks, camera, again, sigma)
         # Errors of a track are correlated: `focal_runs` observations count as one.
@@ -222,18 +228,18 @@ def _other_focal(
 def _misfit(
     tracks: Tracks, camera: Intrinsics, found: Reconstruction, sigma: float
 ) -> float:
-    """Twice the negative log-likelihood of all tracks by a reconstruction, with a noise
-    of `sigma` px; an observation that it does not explain costs `_UNEXPLAINED`."""
+    """Returns twice the negative log-likelihood of all tracks given a reconstruction
+    and a noise of `sigma` px; an unexplained observation costs `_UNEXPLAINED_COST`."""
     scene, views = _scene(tracks, camera, found)
     error = errors(scene, views) * float(np.sqrt(np.prod(camera.params[:2])))
-    cost = np.minimum((error / sigma) ** 2, _UNEXPLAINED)
-    return float(cost.sum() + _UNEXPLAINED * (len(tracks.frame) - len(error)))
+    cost = np.minimum((error / sigma) ** 2, _UNEXPLAINED_COST)
+    return float(cost.sum() + _UNEXPLAINED_COST * (len(tracks.frame) - len(error)))
 
 
 def _with_lens(
     lens: Lens, intrinsics: Intrinsics, zoom: Float[np.ndarray, " t"]
 ) -> tuple[Float[np.ndarray, " t"], Intrinsics]:
-    """The zoom and the camera with the deviations that a model allows."""
+    """Returns the zoom and the intrinsics with the deviations that a model allows."""
     params = np.asarray(intrinsics.params, float).copy()
     aspect, focal = 0.0, lens.focal
     if "zoom" in lens.model:
@@ -265,19 +271,22 @@ def _turning_zoom(
         return None
     K, distortion = as_opencv(intrinsics.params)
     views = Views(tracks.frame, tracks.landmark, rays(tracks.uv, K, distortion))
-    # Errors of both views, whose variances add up.
-    limit = max(TURNING_ERROR, 2.0 * ERROR_PER_SIGMA * np.sqrt(2) * noise_of(tracks))
+    # The variances of both views' errors add up.
+    limit = max(
+        MAX_ROTATION_ERROR_PX, 2.0 * ERROR_PER_SIGMA * np.sqrt(2) * noise_of(tracks)
+    )
     return turning_zoom(views, num_frames, limit / K[0, 0])
 
 
 def _examine(
     tracks: Tracks, intrinsics: Intrinsics, found: Reconstruction, prior: LensPrior
 ) -> tuple[Lens, ...]:
-    """The ordinary camera and its alternatives; none unless the camera translates."""
+    """Returns the ordinary camera and its alternatives; none unless the camera
+    translates."""
     if found.kind != "moving":
         return ()
     K, _ = as_opencv(intrinsics.params)
-    # Outliers too: under a wrong lens model they carry the information.
+    # Outliers are included: under a wrong lens model they carry the information.
     scene, views = _scene(tracks, intrinsics, found)
     return examine_lens(
         scene,
@@ -292,8 +301,8 @@ def _examine(
 def _scene(
     tracks: Tracks, intrinsics: Intrinsics, found: Reconstruction
 ) -> tuple[Scene, Views]:
-    """Cameras and points of a reconstruction, and all observations of these points in
-    frames that it has registered."""
+    """Returns the cameras and points of a reconstruction, and all observations of these
+    points in registered frames."""
     K, distortion = as_opencv(intrinsics.params)
     of = np.full(int(tracks.landmark.max()) + 1, -1)
     of[found.landmark_ids] = np.arange(len(found.landmark_ids))
@@ -305,14 +314,14 @@ def _scene(
 
 
 def _locates_as_many(again: Reconstruction, found: Reconstruction) -> bool:
-    """Whether two reconstructions are of one kind, and `again` has no frame less."""
+    """Returns True if both are of one kind, and `again` registers as many frames."""
     return bool(
         again.kind == found.kind and again.registered.sum() >= found.registered.sum()
     )
 
 
 def _no_worse(again: Reconstruction, found: Reconstruction) -> bool:
-    """Whether reconstruction `again` is not worse than `found`.
+    """Returns True if reconstruction `again` is not worse than `found`.
 
     It must be of the same kind, register as many frames, and have about as many inlier
     observations and as small a reprojection error.
@@ -326,7 +335,7 @@ def _no_worse(again: Reconstruction, found: Reconstruction) -> bool:
 
 
 def _doubt(lens: Lens, intrinsics: Intrinsics, why: str) -> str:
-    """What a camera that is not used would be, and what settles it."""
+    """Returns the warning about a probable camera model that is not used."""
     said = []
     if "aspect" in lens.model:
         ratio = intrinsics.params[0] / intrinsics.params[1]

@@ -9,16 +9,19 @@ from bodyslam_jax.sfm.bundle import Views
 from bodyslam_jax.sfm.multiview import fit_rotation
 from bodyslam_jax.types import Intrinsics, Tracks
 
-_FOLLOWED = 0.05
-"""Share of the points that remain tracked over a frame of quick motion."""
-_MOST_LOST = 0.3
-_LEAP = 10.0, 0.08
-"""A displacement between frames is a cut beyond this multiple of the median, if it is
-also beyond this distance at depth 1."""
+_MIN_FOLLOWED_SHARE = 0.05
+"""Least share of points that are tracked from frame to frame, however quick the
+motion."""
+_LOW_FOLLOWED_SHARE = 0.3
+"""Share of tracked points below which a displacement half as large is a cut."""
+_JUMP_LIMITS = 10.0, 0.08
+"""A displacement between frames is a cut beyond this multiple of the median
+displacement, if it is also beyond this distance at depth 1."""
 
 
 def find_cuts(views: Views, num_frames: int, min_shared: int) -> list[int]:
-    """First frames of shots: 0, and those that share too few points with the last."""
+    """Returns the first frames of shots: 0, and those that share fewer than
+    `min_shared` points with the frame before."""
     ordered = np.lexsort((views.frame, views.landmark))
     frame, landmark = views.frame[ordered], views.landmark[ordered]
     same = landmark[1:] == landmark[:-1]
@@ -32,9 +35,11 @@ def find_cuts(views: Views, num_frames: int, min_shared: int) -> list[int]:
 
 
 def find_jumps(views: Views, num_frames: int, min_shared: int) -> list[int]:
-    """Frames to which almost no point is followed from the frame before, though both
-    have many, or all leap many times as far as from frame to frame elsewhere: a cut,
-    also where points are found again beyond it."""
+    """Returns the frames of cuts beyond which the same points are found again.
+
+    At a cut almost no point is tracked from the frame before, although both have many,
+    or all points move many times as far as between other frames.
+    """
     followed = np.zeros(num_frames, dtype=np.int64)
     ordered = np.lexsort((views.frame, views.landmark))
     frame, landmark = views.frame[ordered], views.landmark[ordered]
@@ -42,24 +47,25 @@ def find_jumps(views: Views, num_frames: int, min_shared: int) -> list[int]:
     np.add.at(followed, frame[1:][on], 1)
     count = np.bincount(frame, minlength=num_frames)
     fewest = np.minimum(count[1:], count[:-1])
-    lost = (fewest >= 2 * min_shared) & (followed[1:] < _FOLLOWED * fewest)
+    lost = (fewest >= 2 * min_shared) & (followed[1:] < _MIN_FOLLOWED_SHARE * fewest)
     xy = views.xy[ordered]
     step = np.linalg.norm(xy[1:] - xy[:-1], axis=-1)[on]
     into = frame[1:][on]
     typical = [
         np.median(step[into == k]) if followed[k] else 0.0 for k in range(1, num_frames)
     ]
-    leap = _LEAP[0] * np.median(typical) if typical else 0.0
-    far = np.asarray(typical) / max(leap, _LEAP[1])
-    # Half as far will do where most points are lost as well.
-    lost |= (far > 1) | ((far > 0.5) & (followed[1:] < _MOST_LOST * fewest))
+    leap = _JUMP_LIMITS[0] * np.median(typical) if typical else 0.0
+    far = np.asarray(typical) / max(leap, _JUMP_LIMITS[1])
+    # Half the displacement suffices where most points are lost as well.
+    lost |= (far > 1) | ((far > 0.5) & (followed[1:] < _LOW_FOLLOWED_SHARE * fewest))
     return (np.flatnonzero(lost) + 1).tolist()
 
 
 def choose_keyframes(
     views: Views, first: int, last: int, motion: float, min_shared: int
 ) -> Int[np.ndarray, " k"]:
-    """Frames between which points moved by `motion` (at depth 1) or many are new."""
+    """Returns frames between which points moved by `motion` (at depth 1), or many of
+    which are new."""
     by_frame = _by_frame(views)
     chosen = [first]
     ids, xy = by_frame.get(first, _nothing())
@@ -83,7 +89,7 @@ def choose_keyframes(
 
 
 def stillness(views: Views, window: int = 10) -> float:
-    """Image motion of points at depth 1: the median over points of the largest distance
+    """Returns the image motion of points at depth 1: the median of the largest distance
     between their median position in the first `window` frames and in any later ones.
 
     Medians over windows suppress tracking noise, so that noise of 0.5 px at 640x480
@@ -104,7 +110,7 @@ def stillness(views: Views, window: int = 10) -> float:
 
 
 def background_motion(tracks: Tracks, intrinsics: Intrinsics) -> float:
-    """How far the points of the tracks move, px (`stillness`); NaN without any."""
+    """Returns the image motion of the tracks, px (`stillness`); NaN without any."""
     if not len(tracks.frame):
         return float("nan")
     K, distortion = as_opencv(intrinsics.params)
@@ -116,10 +122,10 @@ def background_motion(tracks: Tracks, intrinsics: Intrinsics) -> float:
 def rotation_error(
     views: Views, keyframes: Int[np.ndarray, " k"], scale: float
 ) -> Float[np.ndarray, "p 4"]:
-    """Residuals of a pure rotation between pairs of keyframes.
+    """Returns the residuals of a pure rotation between pairs of keyframes.
 
-    Returns: for each pair of keyframes that share 30 points or more: first, second, the
-    median angle (rad) left after the best rotation, and how many points they share.
+    Rows are of pairs that share 30 points or more: first and second frame, the median
+    residual angle (rad) of the best rotation, and the number of shared points.
     """
     by_frame = _by_frame(views)
     rows = []
@@ -146,11 +152,12 @@ def rotations_only(
 ) -> tuple[
     Float[np.ndarray, "t 3 3"], Float[np.ndarray, "l 3"], Bool[np.ndarray, " t"]
 ]:
-    """Rotations R_CW of a camera that only turns, and directions to the points.
+    """Estimates rotations R_CW of a camera that only turns, and directions to points.
 
-    First frame by frame, then all together: every direction the mean of its rays, every
-    rotation the best for its directions, in turn. With `turns` false the rotations are
-    the identity and only the directions are sought.
+    It begins frame by frame, then alternates between all directions, each the robust
+    mean of its rays, and all rotations, each the best for its directions. Without
+    `turns` the rotations are the identity. Returns rotations, directions, and which
+    frames were solved.
     """
     by_frame = _by_frame(views)
     R = np.tile(np.eye(3), (num_frames, 1, 1))

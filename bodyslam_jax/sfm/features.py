@@ -1,4 +1,4 @@
-"""Image -> BRISK keypoints and descriptors; pairs of points -> RANSAC inliers.
+"""BRISK keypoints, spread over the image; descriptor matching; epipolar RANSAC.
 
 BRISK: Leutenegger et al., ICCV 2011, the detector of Henning et al. (ECCV 2022).
 """
@@ -11,31 +11,35 @@ from jaxtyping import Bool, Float, UInt8
 
 from bodyslam_jax.config.errors import InputError
 
-_NO_BRISK = (
+_MISSING_BRISK_TEXT = (
     f"OpenCV {cv2.__version__} has no BRISK: install opencv-python-headless<5 or "
     "opencv-contrib-python-headless."
 )
 
 
 def make_brisk(threshold: int, octaves: int) -> Any:
-    """OpenCV's BRISK, wherever this build of OpenCV keeps it.
+    """Returns OpenCV's BRISK, from the main module or the contributed ones.
 
-    **Raises:** `InputError`, saying how to get it, if it is in neither place.
+    **Raises:** `InputError` that says how to install it, if OpenCV has none.
     """
     home = _home_of_brisk()
     if home is None:
-        raise InputError(_NO_BRISK)
+        raise InputError(_MISSING_BRISK_TEXT)
     return home.BRISK_create(threshold, octaves)
 
 
 def brisk_status() -> str:
-    """One line of text: which module has BRISK, or how to get it."""
+    """Returns one line of text: which module has BRISK, or how to install it."""
     home = _home_of_brisk()
-    return _NO_BRISK if home is None else f"found in {home.__name__} {cv2.__version__}"
+    return (
+        _MISSING_BRISK_TEXT
+        if home is None
+        else f"found in {home.__name__} {cv2.__version__}"
+    )
 
 
 def _home_of_brisk() -> Any | None:
-    """The module that has BRISK: OpenCV 5 moved it to the contributed ones."""
+    """Returns the module that has BRISK: OpenCV 5 moved it to the contributed ones."""
     modules = (cv2, getattr(cv2, "xfeatures2d", None))
     return next((p for p in modules if hasattr(p, "BRISK_create")), None)
 
@@ -61,7 +65,7 @@ def spread(
     """
     columns, rows = -(-size[0] // cell), -(-size[1] // cell)
     lacking = np.full((rows, columns), quota)
-    # A blocked map at one entry per pixel is quicker than any search for neighbours.
+    # A map of blocked pixels is faster than a search for neighbours.
     blocked = np.zeros((size[1], size[0]), dtype=np.uint8)
     radius = max(1, round(distance))
     for x, y in taken:
@@ -86,7 +90,7 @@ def spread(
 def epipolar_inliers(
     xy_a: Float[np.ndarray, "n 2"], xy_b: Float[np.ndarray, "n 2"], threshold: float
 ) -> Bool[np.ndarray, " n"]:
-    """Which pairs fit one essential matrix; all of them if there are too few to test.
+    """Returns which pairs fit one essential matrix; all if there are too few to test.
 
     Args:
         xy_a, xy_b: undistorted points at depth 1.
@@ -105,7 +109,7 @@ def epipolar_inliers(
 def match(
     a: UInt8[np.ndarray, "n d"], b: UInt8[np.ndarray, "m d"], *, ratio: float = 0.8
 ) -> np.ndarray:
-    """Mutual nearest descriptors (k, 2) whose second-best is clearly worse."""
+    """Returns pairs (k, 2) of mutually nearest descriptors that pass the ratio test."""
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), dtype=np.int64)
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING)

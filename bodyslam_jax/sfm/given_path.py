@@ -1,9 +1,9 @@
-"""A given camera path against point tracks: how well do the tracks fit it.
+"""Tests how well point tracks fit a given camera path.
 
-A point that stands still is seen along one ray per frame; under the right poses these
-rays meet, whatever the unit of the path. The share of observations whose point
-projects to them within a threshold is the path's *fit*. It is compared with what a
-right path reaches given the noise of the tracks and of such paths.
+A static point is seen along one ray per frame; under the correct poses these rays
+intersect, whatever the unit of the path. The share of observations to which their point
+projects within a threshold is the path's *fit*. It is compared with that of a correct
+path given the noise of the tracks and of such paths.
 """
 
 import copy
@@ -19,35 +19,37 @@ from bodyslam_jax.sfm.camera_motion import choose_keyframes
 from bodyslam_jax.sfm.multiview import relative_pose
 from bodyslam_jax.types import Intrinsics, Tracks
 
-MIN_TESTED = 200
-"""Observations below which a path is not compared with the images."""
+MIN_TESTED_OBSERVATIONS = 200
+"""Least number of observations with which a path is compared."""
 MIN_VIEWS = 3
-"""Views of a point that test a path: with two, only one number of four is redundant."""
+"""Least number of views of a point that tests a path: with two, only one coordinate of
+four is redundant."""
 _PATH_NOISE = 1 / 640
-"""Noise of the images of points under a right path, of the image's longer side: visual
-SLAM weights its observations with 1 px at 640 to 752 px (ORB-SLAM, Mur-Artal et al.,
-T-RO 2015), and reprojection errors of COLMAP's models are smaller."""
-_TRACK_NOISE = 0.5
-"""px; noise of tracks where no pair of frames tells it."""
-_THRESHOLD = 2.0
-"""Error of an observation that fits, in standard deviations: 86 % of a right path's
-two-dimensional errors are smaller."""
-_NOISIEST = 2.0
-"""Noise of a path that is still accepted, in that of `_PATH_NOISE` and of the
+"""Noise of projections under a correct path, as a share of the image's longer side:
+visual SLAM weights its observations with 1 px at 640 to 752 px (ORB-SLAM, Mur-Artal et
+al., T-RO 2015), and reprojection errors of COLMAP's models are smaller."""
+_TRACK_NOISE_PX = 0.5
+"""Noise of tracks, px, where no pair of frames determines it."""
+_THRESHOLD_SIGMAS = 2.0
+"""Largest error of an observation that fits, in standard deviations: 86 % of the
+two-dimensional errors of a correct path are smaller."""
+_MAX_NOISE_RATIO = 2.0
+"""Largest noise of an accepted path, as a multiple of that of a correct path and of the
 tracks together."""
 _MAX_TRACKS, _VIEWS_PER_TRACK = 400, 8
-_BLOCK_FRAMES, _MAX_BLOCKS = 10, 20
-"""Frames of a block of time, errors in which are correlated, at least; and most
-blocks."""
-_BEHIND = 10.0
-"""Error, at depth 1, of a point that would lie behind the camera."""
-_ITERATIONS = 6
-"""Of Gauss--Newton for a point; two more change shares by less than 0.1 %."""
-_SAME_COST = 0.02
-"""Difference of the mean cost of a block's observations that tells nothing."""
-_SIGNIFICANT, _UNLIKELY = 3.0, 0.01
-"""Standard errors beyond which, and probability of chance below which, two offsets do
-not fit equally well."""
+_MIN_BLOCK_FRAMES, _MAX_BLOCKS = 10, 20
+"""Least length of a block of time, within which errors are correlated, and
+largest number of blocks."""
+_ERROR_BEHIND_CAMERA = 10.0
+"""Error, at depth 1, that counts for a point behind the camera."""
+_NUM_ITERATIONS = 6
+"""Number of Gauss--Newton iterations for a point; two more change shares by less than
+0.1 %."""
+_MAX_EQUAL_COST_DIFFERENCE = 0.02
+"""Difference of a block's mean cost up to which two offsets fit it equally well."""
+_SIGNIFICANCE_SIGMAS, _MAX_CHANCE = 3.0, 0.01
+"""Number of standard errors beyond which, or probability of the signs by chance below
+which, two offsets do not fit equally well."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,31 +57,31 @@ class Fit:
     """How well tracks fit a path."""
 
     share: float
-    """Of the tested observations, those within `threshold` of where the path has
-    them."""
+    """Share of the tested observations within `threshold` of the projection of their
+    point."""
     tested: int
-    """Observations of points that are seen in three or more frames with a pose."""
+    """Number of observations of points seen in three or more frames with a pose."""
     expected: float
-    """`share` of a right path, given the noise of tracks and of such paths."""
+    """`share` of a correct path, given the noise of tracks and of such paths."""
     required: float
-    """`share` of a path with `_NOISIEST` times that noise."""
+    """`share` of a path with `_MAX_NOISE_RATIO` times that noise."""
     threshold: float
-    """px"""
+    """Largest error of an observation that fits, px."""
 
     @property
     def doubtful(self) -> float:
-        """Share below which a right path would be surprising."""
+        """Returns the share below which a correct path is improbable."""
         return (self.expected + self.required) / 2
 
     @property
     def convinces(self) -> bool:
-        """Whether it fits well enough for a path whose offset was chosen to fit: that
-        alone lets a third of the points fit a path that is none."""
+        """Returns True if the fit suffices for a path whose offset was chosen to fit:
+        that choice alone lets a third of the points fit a wrong path."""
         return not self.is_tested or self.share >= self.doubtful
 
     @property
     def is_tested(self) -> bool:
-        return self.tested >= MIN_TESTED
+        return self.tested >= MIN_TESTED_OBSERVATIONS
 
     @property
     def fits(self) -> bool:
@@ -87,7 +89,7 @@ class Fit:
 
 
 class PathTest:
-    """A sample of tracks, against which paths and offsets are tested."""
+    """Tests paths and offsets against a sample of tracks."""
 
     def __init__(self, tracks: Tracks, intrinsics: Intrinsics, num_frames: int):
         K, distortion = as_opencv(intrinsics.params)
@@ -97,17 +99,17 @@ class PathTest:
         longer = max(intrinsics.width, intrinsics.height)
         path_noise = _PATH_NOISE * longer
         share, track_noise = _static_share(
-            views, self.focal, 2 * _THRESHOLD * path_noise, longer
+            views, self.focal, 2 * _THRESHOLD_SIGMAS * path_noise, longer
         )
         self.noise = float(np.hypot(track_noise, path_noise))
-        self.threshold = _THRESHOLD * self.noise
-        self.expected = share * _within(_THRESHOLD)
-        self.required = share * _within(_THRESHOLD / _NOISIEST)
+        self.threshold = _THRESHOLD_SIGMAS * self.noise
+        self.expected = share * _within(_THRESHOLD_SIGMAS)
+        self.required = share * _within(_THRESHOLD_SIGMAS / _MAX_NOISE_RATIO)
         self.views = views
-        self._take(views, max(num_frames / _MAX_BLOCKS, float(_BLOCK_FRAMES)))
+        self._take(views, max(num_frames / _MAX_BLOCKS, float(_MIN_BLOCK_FRAMES)))
 
     def _take(self, views: Views, block_frames: float) -> None:
-        """Takes a new sample of tracks from these views."""
+        """Draws a new sample of tracks from these views."""
         self.frame, self.xy, self.used = _sample(views, self.num_frames)
         count = np.maximum(self.used.sum(1), 1)
         middle = np.where(self.used, self.frame, 0).sum(1) / count
@@ -115,15 +117,15 @@ class PathTest:
         self.block = (middle / block_frames).astype(int)
 
     def in_pieces(self, span: int) -> "PathTest":
-        """The test with tracks cut into pieces within intervals of `span` frames, each
-        of which is a block."""
+        """Returns the test with tracks cut into pieces within intervals of `span`
+        frames, each of which is a block."""
         views, cut = self.views, copy.copy(self)
         piece = views.landmark * (self.num_frames // span + 1) + views.frame // span
         cut._take(Views(views.frame, piece, views.xy), float(span))
         return cut
 
     def around(self, first: float, last: float) -> "PathTest":
-        """The test with a sample of tracks within some frames only, which is denser."""
+        """Returns the test with a denser sample, of tracks within some frames only."""
         within = (self.views.frame >= first) & (self.views.frame <= last)
         part = copy.copy(self)
         part._take(self.views[np.flatnonzero(within)], self.block_frames)
@@ -132,8 +134,8 @@ class PathTest:
     def errors(
         self, T_WC: Float[np.ndarray, "t 4 4"], known: Bool[np.ndarray, " t"]
     ) -> Float[np.ndarray, "k v"]:
-        """Reprojection errors, px, of the sample's points, each at the place where it
-        fits best; NaN where the path does not test them."""
+        """Returns the reprojection errors, px, of the sample's points, each at its best
+        position; NaN where the path does not test them."""
         use = self.used & known[self.frame]
         use &= (use.sum(1) >= MIN_VIEWS)[:, None]
         found = np.full(use.shape, np.nan)
@@ -150,7 +152,7 @@ class PathTest:
     def fit(
         self, T_WC: Float[np.ndarray, "t 4 4"], known: Bool[np.ndarray, " t"]
     ) -> Fit:
-        """How well a pose for each frame, or for those in `known`, fits."""
+        """Returns the fit of a path with a pose for each frame in `known`."""
         error = self.errors(T_WC, known)
         tested = ~np.isnan(error)
         share = float((error[tested] < self.threshold).mean()) if tested.any() else 0.0
@@ -159,7 +161,7 @@ class PathTest:
         )
 
     def cost(self, error: Float[np.ndarray, "k v"]) -> Float[np.ndarray, "b 2"]:
-        """Robust cost (Cauchy) and number of the tested observations of each block."""
+        """Returns the robust cost (Cauchy) and number of observations by block."""
         tested = ~np.isnan(error)
         cost = np.where(tested, np.log1p((error / self.noise) ** 2), 0.0)
         num = int(self.block.max()) + 1 if len(self.block) else 1
@@ -168,21 +170,25 @@ class PathTest:
 
 
 def mean_cost(cost: Float[np.ndarray, "b 2"]) -> float:
-    """Mean cost of the tested observations; infinite if there are too few."""
+    """Returns the mean cost of tested observations; infinite if there are too few."""
     count = cost[:, 1].sum()
-    return float(cost[:, 0].sum() / count) if count >= MIN_TESTED else float("inf")
+    return (
+        float(cost[:, 0].sum() / count)
+        if count >= MIN_TESTED_OBSERVATIONS
+        else float("inf")
+    )
 
 
 def is_worse(one: Float[np.ndarray, "b 2"], other: Float[np.ndarray, "b 2"]) -> bool:
-    """Whether the first of two costs is significantly larger: by the scatter of the
-    difference between blocks of time that both test, or by its sign in them."""
+    """Returns True if the first of two costs is significantly larger, by its standard
+    error or a sign test over the blocks of time that both test."""
     both = (one[:, 1] > 0) & (other[:, 1] > 0)
     if both.sum() < 2:
         return mean_cost(one) > mean_cost(other)
     a, b = one[both], other[both]
     difference = a[:, 0] / a[:, 1] - b[:, 0] / b[:, 1]
-    # Blocks that both explain alike tell nothing.
-    telling = np.abs(difference) > _SAME_COST
+    # Blocks that both explain equally well are not informative.
+    telling = np.abs(difference) > _MAX_EQUAL_COST_DIFFERENCE
     weight, difference = np.minimum(a[:, 1], b[:, 1])[telling], difference[telling]
     num = len(difference)
     if num < 2:
@@ -191,14 +197,16 @@ def is_worse(one: Float[np.ndarray, "b 2"], other: Float[np.ndarray, "b 2"]) -> 
     scatter = weight @ (difference - mean) ** 2 / weight.sum()
     error = np.sqrt(scatter / (num - 1)) + 1e-6
     chance = float(binom.sf((difference > 0).sum() - 1, num, 0.5))
-    return bool(mean > 0 and (mean > _SIGNIFICANT * error or chance < _UNLIKELY))
+    return bool(
+        mean > 0 and (mean > _SIGNIFICANCE_SIGMAS * error or chance < _MAX_CHANCE)
+    )
 
 
 def what_would_fit(
     test: PathTest, T_WC: Float[np.ndarray, "t 4 4"], known: Bool[np.ndarray, " t"]
 ) -> str | None:
-    """How poses that do not fit are to be read so that they do; `None` if no way is
-    known."""
+    """Returns the convention under which poses fit, if they do not fit as given; `None`
+    if no known one does."""
     opengl = T_WC.copy()
     opengl[:, :3, :3] *= np.array([1.0, -1.0, -1.0])
     inverse = np.linalg.inv(T_WC)
@@ -217,22 +225,23 @@ def what_would_fit(
 
 
 def _within(sigmas: float) -> float:
-    """Probability that a two-dimensional normal error is shorter than `sigmas`."""
+    """Returns the probability of a two-dimensional normal error below `sigmas`."""
     return float(1 - np.exp(-(sigmas**2) / 2))
 
 
 def _static_share(
     views: Views, focal: float, threshold: float, longer: int
 ) -> tuple[float, float]:
-    """Share of observations that fit the best relative pose of two frames, and the
-    noise of tracks (px), by pairs of frames between which points move.
+    """Estimates the share of observations that fit the best relative pose of two
+    frames, and the noise of tracks (px), from pairs of frames between which points
+    move.
 
     Args:
         threshold: px.
         longer: the image's longer side, px.
     """
     if not len(views.frame):
-        return 1.0, _TRACK_NOISE
+        return 1.0, _TRACK_NOISE_PX
     first, last = int(views.frame.min()), int(views.frame.max())
     keyframes = choose_keyframes(views, first, last, 0.03 * longer / focal, 12)
     order = np.argsort(views.frame, kind="stable")
@@ -255,16 +264,16 @@ def _static_share(
         away = _sampson(*xy, pose[0], pose[1]) * focal
         good = away < threshold
         shares.append(good.mean())
-        # 0.6745: the median of a normal error's size.
-        noises.append(np.median(away[good]) / 0.6745 if good.any() else _TRACK_NOISE)
+        # 0.6745 is the median absolute value of a standard normal error.
+        noises.append(np.median(away[good]) / 0.6745 if good.any() else _TRACK_NOISE_PX)
     if not shares:
-        return 1.0, _TRACK_NOISE
+        return 1.0, _TRACK_NOISE_PX
     return float(np.median(shares)), float(np.median(noises))
 
 
 def _sampson(xy_a, xy_b, R: np.ndarray, t: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Distance of pairs of points from the epipolar geometry of R_BA and t, at depth
-    1, as an error of each of the two points."""
+    """Returns the distance of pairs of points from the epipolar geometry of R_BA and t,
+    at depth 1, as an error of each of the two points."""
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     E = cross @ R
     one = np.ones((len(xy_a), 1))
@@ -277,8 +286,8 @@ def _sampson(xy_a, xy_b, R: np.ndarray, t: np.ndarray) -> Float[np.ndarray, " n"
 def _sample(
     views: Views, num_frames: int
 ) -> tuple[Int[np.ndarray, "k v"], Float[np.ndarray, "k v 2"], Bool[np.ndarray, "k v"]]:
-    """Up to `_MAX_TRACKS` of the longest tracks, spread over the video, in up to
-    `_VIEWS_PER_TRACK` views each, which lie apart evenly."""
+    """Draws up to `_MAX_TRACKS` of the longest tracks, spread over the video, with up
+    to `_VIEWS_PER_TRACK` evenly spaced views each."""
     order = np.lexsort((views.frame, views.landmark))
     landmark = views.landmark[order]
     start = np.flatnonzero(np.diff(landmark, prepend=-1))
@@ -313,13 +322,15 @@ def _errors_of_best_points(
     use: Bool[np.ndarray, "k v"],
     scale: float,
 ) -> Float[np.ndarray, "k v"]:
-    """Reprojection errors at depth 1 of points in front of the cameras that fit best.
+    """Returns the reprojection errors at depth 1 of the best points in front of the
+    cameras.
 
-    A point is x, y at depth 1 and the inverse depth in its middle view, so that one
-    without parallax is at infinity; robust Gauss--Newton (Cauchy, `scale`).
+    A point has x, y at depth 1 and the inverse depth in its middle view, so that one
+    without parallax is at infinity. It is found by robust Gauss--Newton (Cauchy,
+    `scale`).
     """
     num, most = use.shape
-    # The view nearest to the middle of those that are used.
+    # The anchor is the middle one of the used views.
     rank = np.cumsum(use, axis=1) * use
     anchor = np.argmin(np.abs(rank - (use.sum(1)[:, None] + 1) // 2), axis=1)
     row = np.arange(num)
@@ -330,8 +341,8 @@ def _errors_of_best_points(
     point = np.concatenate([xy[row, anchor], np.zeros((num, 1))], axis=1)
     weight = use.astype(float)
     error = np.zeros((num, most))
-    for turn in range(_ITERATIONS):
-        if turn >= _ITERATIONS // 2:  # behind infinity no point is seen
+    for turn in range(_NUM_ITERATIONS):
+        if turn >= _NUM_ITERATIONS // 2:  # a negative inverse depth is not visible
             point[:, 2] = np.maximum(point[:, 2], 0.0)
         ray = np.concatenate([point[:, :2], np.ones((num, 1))], axis=1)
         p = (R @ ray[:, None, :, None])[..., 0] + point[:, None, 2:] * t
@@ -339,8 +350,8 @@ def _errors_of_best_points(
         z = np.where(front, p[..., 2], 0.05)[..., None]
         predicted = p[..., :2] / z
         away = xy - predicted
-        error = np.where(front, np.linalg.norm(away, axis=-1), _BEHIND)
-        if turn == _ITERATIONS - 1:
+        error = np.where(front, np.linalg.norm(away, axis=-1), _ERROR_BEHIND_CAMERA)
+        if turn == _NUM_ITERATIONS - 1:
             break
         if turn:
             weight = use * front / (1 + (error / scale) ** 2)
@@ -351,9 +362,9 @@ def _errors_of_best_points(
         b = (weighted @ away.reshape(num, -1, 1))[..., 0]
         size = np.trace(A, axis1=1, axis2=2)
         A += (1e-9 * size + 1e-30)[:, None, None] * np.eye(3)
-        if turn >= _ITERATIONS // 2:
+        if turn >= _NUM_ITERATIONS // 2:
             A[:, 2, 2] += np.where(point[:, 2] <= 0, 1e12, 0.0)
         step = np.linalg.solve(A, b[..., None])[..., 0]
-        # A step of the inverse depth to behind a camera would not come back.
+        # A step of the inverse depth to behind a camera could not be reverted.
         point = point + np.clip(step, -2.0, 2.0)
     return error

@@ -1,8 +1,8 @@
-"""Tracks -> cameras and map, up to scale: incremental structure from motion.
+"""Incremental structure from motion: cameras and map, up to scale, from tracks.
 
-The first pair is chosen by what grows from it; every other camera comes from 3D-2D
-RANSAC; points are triangulated again and again as views arrive; a small bundle
-adjustment runs in between. Keyframes first, then the frames between them.
+The first pair is that whose map grows best; every other camera is located by 3D-2D
+RANSAC; points are triangulated again as views arrive; a small bundle adjustment runs in
+between. Keyframes are located first, then the frames between them.
 """
 
 import logging
@@ -17,25 +17,26 @@ from bodyslam_jax.types import CameraPath
 
 _log = logging.getLogger(__name__)
 
-_FIRST_PAIRS = 4
-"""Pairs of keyframes that are tried as the start of the map; assumes no noise level, as
-the best is chosen by its share of inliers."""
-MIN_SHARED = 12
-"""Points that two frames must share to be related."""
-_RELAXED = 3
-"""Rounds with a smaller parallax threshold where cameras cannot be located."""
-_PLANAR = 0.9
-"""Share of a pair's inliers from which a plane explains them, so that its two poses are
-tried: a plane with the outliers that tracks have."""
-FEW_POINTS, _NEIGHBOURS = 25, 10
-"""Points below which a camera is located poorly; keyframes before and after it in
-which two candidate maps are compared."""
+_NUM_FIRST_PAIRS = 4
+"""Number of pairs of keyframes that are tried as the start of the map. It assumes no
+noise level, as the best is chosen by its share of inliers."""
+MIN_SHARED_POINTS = 12
+"""Least number of points that two related frames share."""
+_NUM_RELAXED_ROUNDS = 3
+"""Number of rounds with a smaller parallax threshold where
+cameras cannot be located."""
+_MIN_PLANAR_SHARE = 0.9
+"""Least share of a pair's inliers that a plane explains, for its two poses to be tried:
+a plane with the outliers that tracks have."""
+MIN_RELIABLE_POINTS, _NEIGHBOUR_KEYFRAMES = 25, 10
+"""Number of points below which a camera is located poorly; number of keyframes before
+and after it in which two candidate maps are compared."""
 
 
 def build_map(
     make: Callable[[], "Builder"], keyframes: np.ndarray, pairs: np.ndarray
 ) -> tuple["Builder", PartialMap] | None:
-    """The map that grows best over the keyframes of one shot.
+    """Returns the map that grows best over the keyframes of one shot.
 
     Where few points are visible, translation along a plane may be mistaken for a
     rotation: a map that grows across such a section bends, and bundle adjustment does
@@ -43,12 +44,12 @@ def build_map(
     map with more inliers around the section is kept, unless it loses cameras.
 
     Args:
-        make: a builder that has not begun yet.
+        make: returns a new builder.
         pairs: frames, error of a turning camera and common points of each pair of
             keyframes, as from `rotation_error`.
     """
     builder = make()
-    grown = builder.build(keyframes, first_pairs(pairs, _FIRST_PAIRS))
+    grown = builder.build(keyframes, first_pairs(pairs, _NUM_FIRST_PAIRS))
     if grown is None:
         return None
     best = builder, grown
@@ -57,7 +58,7 @@ def build_map(
         before, after = pairs[:, :2] < thinnest, pairs[:, :2] > thinnest
         beyond = before if builder.origin > thinnest else after
         other = make()
-        starts = first_pairs(pairs[beyond.all(axis=1)], _FIRST_PAIRS)
+        starts = first_pairs(pairs[beyond.all(axis=1)], _NUM_FIRST_PAIRS)
         again = other.build(keyframes, starts)
         located = lambda growing: np.count_nonzero(growing.registered[keyframes])
         if (
@@ -67,7 +68,7 @@ def build_map(
         ):
             at = np.searchsorted(keyframes, sorted(builder.thin | other.thin))
             away = np.abs(np.arange(len(keyframes))[:, None] - at).min(axis=1)
-            near = keyframes[away <= _NEIGHBOURS]
+            near = keyframes[away <= _NEIGHBOUR_KEYFRAMES]
             scores = builder.score(grown, near), other.score(again, near)
             _log.debug("around frame %d: %.3f, and %.3f from beyond", thinnest, *scores)
             if scores[1] > scores[0]:
@@ -77,7 +78,8 @@ def build_map(
 
 
 def first_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Pairs of keyframes to start from: much parallax, many points, spread in time.
+    """Returns pairs of keyframes to start from: much parallax, many points, spread in
+    time.
 
     The score saturates at a parallax of 5 degrees and 100 points, far above the effect
     of tracking noise of about 0.5 px (0.06 degrees at 640x480).
@@ -103,10 +105,10 @@ class Builder(Mapper):
     origin = 0
     """Frame that the map grew from."""
     thin: dict[int, int]
-    """Keyframes that were located by few points, and by how many."""
+    """Number of points of each keyframe that was located by few."""
 
     def begin(self, path: CameraPath) -> PartialMap:
-        """The map triangulated from cameras of known poses, which are held fixed."""
+        """Returns the map triangulated from cameras of known poses, which are held."""
         R_WC, centre = path.T_WC[:, :3, :3], path.T_WC[:, :3, 3]
         scene = Scene(
             np.swapaxes(R_WC, 1, 2).copy(),
@@ -126,7 +128,7 @@ class Builder(Mapper):
         return grown
 
     def build(self, keyframes: np.ndarray, pairs: np.ndarray) -> PartialMap | None:
-        """The best of the reconstructions that grow from `pairs` of keyframes.
+        """Returns the best of the maps that grow from `pairs` of keyframes.
 
         Where even the best has many outliers, the noise of the tracks is larger than
         assumed: it is tried again with twice the tolerance.
@@ -149,7 +151,7 @@ class Builder(Mapper):
         self.origin, self.thin = int(np.argmax(best.registered)), {}
         self.joining = self.config.join_tracks
         self._grow(best, keyframes)
-        for _ in range(_RELAXED):
+        for _ in range(_NUM_RELAXED_ROUNDS):
             if best.registered[keyframes].all():
                 break
             # New points have little parallax where the camera mostly rotated.
@@ -170,7 +172,7 @@ class Builder(Mapper):
     ) -> tuple[PartialMap | None, float]:
         best, scores = None, [-1.0]
         for a, b in pairs:
-            # A few more cameras discriminate between correct and wrong starts.
+            # A few more cameras tell correct from wrong starts.
             near = keyframes[np.argsort(np.abs(keyframes - (a + b) / 2))][:8]
             score = -1.0
             for started in self._starts(int(a), int(b)):
@@ -184,7 +186,7 @@ class Builder(Mapper):
                     break
             if score < 0:
                 continue
-            # Two starts that agree: no better one is expected.
+            # Where two starts agree no better one is expected.
             agrees = score > 0.5 and abs(score - max(scores)) < 0.03
             scores.append(score)
             if score > 0.9 or agrees:
@@ -201,23 +203,23 @@ class Builder(Mapper):
         grown.shown[self.revisits.track] = self.views.landmark
 
     def _starts(self, a: int, b: int) -> Iterator[PartialMap]:
-        """Maps of two frames: one for each pose that explains their points."""
+        """Yields maps of two frames: one for each pose that explains their points."""
         _, i, j = np.intersect1d(
             self.views.landmark[self.of_frame[a]],
             self.views.landmark[self.of_frame[b]],
             return_indices=True,
         )
-        if len(i) < MIN_SHARED:
+        if len(i) < MIN_SHARED_POINTS:
             return
         at_a, at_b = self.of_frame[a][i], self.of_frame[b][j]
         xy_a, xy_b = self.views.xy[at_a], self.views.xy[at_b]
         pose = relative_pose(xy_a, xy_b, self.pixel)
-        if pose is None or pose[2].sum() < MIN_SHARED:
+        if pose is None or pose[2].sum() < MIN_SHARED_POINTS:
             return
         started = self._started(a, b, pose, at_a, at_b)
         if started is not None:
             yield started
-        share = _PLANAR * float(pose[2].mean())
+        share = _MIN_PLANAR_SHARE * float(pose[2].mean())
         for other in planar_poses(xy_a, xy_b, self.pixel, share):
             started = self._started(a, b, other, at_a, at_b)
             if started is not None:
@@ -231,7 +233,8 @@ class Builder(Mapper):
         at_a: np.ndarray,
         at_b: np.ndarray,
     ) -> PartialMap | None:
-        """The map of two frames by their relative pose, refined."""
+        """Returns the refined map of two frames with a relative pose; `None` if it has
+        too few points."""
         R, t, good = pose
         scene = Scene(
             np.tile(np.eye(3), (self.num_frames, 1, 1)),
@@ -247,13 +250,13 @@ class Builder(Mapper):
             np.arange(self.num_landmarks),
         )
         self.make_points(grown, np.concatenate([at_a[good], at_b[good]]))
-        if grown.has_point.sum() < MIN_SHARED:
+        if grown.has_point.sum() < MIN_SHARED_POINTS:
             return None
         self._refine(grown, grown.registered & (np.arange(self.num_frames) != a))
         return grown
 
     def _grow(self, grown: PartialMap, frames: np.ndarray) -> None:
-        """Registers `frames`, that with most triangulated points first."""
+        """Registers `frames`, always the one with most triangulated points next."""
         waiting = {int(k) for k in frames if not grown.registered[k]}
         failed: set[int] = set()
         since, at_last = 0, int(grown.registered.sum())
@@ -297,20 +300,20 @@ class Builder(Mapper):
         if found is None or found[2].sum() < max(8, 0.3 * len(at)):
             return False
         grown.scene.R_CW[k], grown.scene.centre[k] = found[:2]
-        if len(at) < FEW_POINTS:
+        if len(at) < MIN_RELIABLE_POINTS:
             self.thin[k] = len(at)
         grown.registered[k] = True
         grown.inlier[at] = found[2]
         return True
 
     def score(self, grown: PartialMap, frames: np.ndarray) -> float:
-        """Share of inliers among the observations in `frames`."""
+        """Returns the share of inliers among the observations in `frames`."""
         return self.share_explained(grown, frames)[0]
 
     def share_explained(
         self, grown: PartialMap, frames: np.ndarray
     ) -> tuple[float, int]:
-        """The same, and how many observations were tested."""
+        """Returns the share of inliers, and the number of tested observations."""
         at = np.concatenate([self.of_frame[int(k)] for k in frames])
         # Only landmarks seen twice can be explained at all.
         observations = np.bincount(

@@ -7,11 +7,11 @@ length as additional parameters, and compared by how well they predict tracks th
 no part in the fit: tracks are divided into blocks, neighbours in the image and in time,
 and each block is predicted by cameras and lens of the others (K-fold cross-validation).
 
-Errors of tracks are common to neighbours and last in time. So standard deviations are
-those of the jackknife over blocks (Efron & Stein, Ann. Stat. 1981), and the logarithm
-of a likelihood ratio counts for the share of independent observations that they imply
-(magnitude adjustment of a composite likelihood; Varin, Reid & Firth, Stat. Sinica
-2011).
+Errors of tracks are correlated between neighbours and over time. So standard deviations
+are those of the jackknife over blocks (Efron & Stein, Ann. Stat. 1981), and the
+logarithm of a likelihood ratio is multiplied by the share of independent observations
+that they imply (magnitude adjustment of a composite likelihood; Varin, Reid & Firth,
+Stat. Sinica 2011).
 """
 
 import dataclasses
@@ -21,49 +21,60 @@ from jaxtyping import Float, Int
 
 from bodyslam_jax.geometry.grouped_sums import sum_by
 from bodyslam_jax.sfm.bundle import Scene, Views
-from bodyslam_jax.sfm.lens_fit import TIMES, LensFit, LensViews, Spread, Unknowns
+from bodyslam_jax.sfm.lens_fit import (
+    NUM_TIME_PIECES,
+    LensFit,
+    LensViews,
+    Spread,
+    Unknowns,
+)
 
-OTHER_FOCAL = ("focal",)
-"""The ordinary camera with another focal length than a calibration's: what a deviation
-is compared with there, which would otherwise win by freeing the focal length."""
-_SINGLE = ("aspect", "radial", "zoom")
+OTHER_FOCAL_MODEL = ("focal",)
+"""The ordinary camera with another focal length than a calibration's. Deviations from a
+calibration are compared with it, as they would otherwise win by a free focal length."""
+_SINGLE_DEVIATIONS = ("aspect", "radial", "zoom")
 """Deviations from an ordinary camera."""
-_PAIRS = (("aspect", "radial"), ("radial", "zoom"))
-"""Those that are considered together, if one of them is more probable than not."""
-_MOST_FRAMES, _MOST_POINTS = 26, 300
-_FEWEST_POINTS = 40
-_FRAMES_A_KNOT = 15
-_MOST_KNOTS = 8
-_RESTARTS = 3
-_MUCH_LOWER = 0.01
-"""Times that the ordinary camera is fitted, and the share by which the cost must fall
-for another."""
-_BISECTIONS = 4
-"""Blocks of tracks are halved so often: 16 blocks of about 19 tracks."""
+_DEVIATION_PAIRS = (("aspect", "radial"), ("radial", "zoom"))
+"""Deviations that are considered together, if one of them is more probable than not."""
+_MAX_FRAMES, _MAX_POINTS = 26, 300
+"""Largest numbers of frames and points that are adjusted."""
+_MIN_POINTS = 40
+_FRAMES_PER_KNOT = 15
+"""Number of frames between two knots of the zoom."""
+_MAX_KNOTS = 8
+_MAX_FITS = 3
+_MIN_REFIT_DECREASE = 0.01
+"""Largest number of fits of the ordinary camera, and least relative decrease of the
+cost for another one."""
+_NUM_BISECTIONS = 4
+"""Number of times that blocks of tracks are halved: 16 blocks of about 19 tracks."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LensPrior:
-    """Standard deviations of a camera's parameters before the video was seen."""
+    """Standard deviations of a camera's parameters a priori."""
 
     focal: tuple[float, float]
-    """Of the logarithm of the focal length, of an ordinary camera and of one that
-    deviates."""
+    """Standard deviations of the logarithm of the focal length, for an ordinary camera
+    and for a deviating one."""
     aspect: tuple[float, float]
-    """Of the logarithm of fx / fy, the same."""
+    """Standard deviations of the logarithm of fx / fy, likewise."""
     radial: tuple[float, float]
-    """Of k1, the same."""
+    """Standard deviations of k1, likewise."""
     zoom: tuple[float, float]
-    """Of the logarithm of the focal length at a knot over that of the first frame."""
+    """Standard deviations of the logarithm of the ratio of the focal length at a knot
+    to that of the first frame, likewise."""
     readout: float
-    """Of the delay of the last row after the first (rolling shutter), in frames."""
+    """Standard deviation of the delay of the last row after the first
+    (rolling shutter), in frames."""
     runs: float
-    """Observations that count as one, because errors within a track are correlated."""
+    """Number of observations that count as one, as errors of a track are correlated."""
     odds: tuple[tuple[str, float], ...]
     """Prior odds of each deviation."""
 
     def information(self, model: tuple[str, ...], knots: int) -> np.ndarray:
-        """Of focal length, aspect, k1 and the zoom's knots, in terms of the cost."""
+        """Returns the prior information on focal length, aspect, k1, readout and the
+        zoom's knots, in units of the cost."""
         pick = lambda name: getattr(self, name)[name in model]
         focal = self.focal[bool(model)]
         sigma = [focal, pick("aspect"), pick("radial"), self.readout]
@@ -71,7 +82,7 @@ class LensPrior:
         return self.runs / np.square(sigma)
 
     def log_odds(self, model: tuple[str, ...]) -> float:
-        """Logarithm of a model's prior odds over the ordinary camera."""
+        """Returns the logarithm of a model's prior odds over the ordinary camera."""
         return float(sum(np.log(odds) for name, odds in self.odds if name in model))
 
 
@@ -80,11 +91,11 @@ class Lens:
     """A camera model fitted to the tracks, and the evidence for it."""
 
     model: tuple[str, ...]
-    """Which deviations it allows: aspect, radial, zoom; none for an ordinary camera;
-    `OTHER_FOCAL` where a calibration is thought to be wrong."""
+    """The deviations that it allows: aspect, radial, zoom; none for an ordinary camera;
+    `OTHER_FOCAL_MODEL` where a calibration is probably wrong."""
     evidence: float
-    """Logarithm of the likelihood ratio to an ordinary camera, by held-out tracks; to
-    that of `OTHER_FOCAL` where that is more probable."""
+    """Logarithm of the likelihood ratio to an ordinary camera by held-out tracks, or to
+    `OTHER_FOCAL_MODEL` where that is more probable."""
     log_odds: float
     """Logarithm of the posterior odds."""
     focal: float
@@ -99,7 +110,7 @@ class Lens:
     zoom: Float[np.ndarray, " t"]
     """Logarithm of the focal length in each frame, 0 in the first that is known."""
     zoom_sigma: float
-    """Of the largest change."""
+    """Standard deviation of the largest change of `zoom`."""
     readout: float
     """Delay of the last row after the first, frames."""
 
@@ -117,13 +128,13 @@ def examine_lens(
     rows: float,
     prior: LensPrior,
 ) -> tuple[Lens, ...]:
-    """The ordinary camera and its alternatives, each with its evidence; empty if there
-    are too few observations.
+    """Returns the ordinary camera and its alternatives, each with its evidence; empty
+    if there are too few observations.
 
     Args:
         scene: cameras and points to begin with.
         registered: frames whose camera is known.
-        pixel: size of a pixel at depth 1: errors are thought no smaller than a fifth.
+        pixel: size of a pixel at depth 1; a fifth of it is the least assumed error.
         rows: height of the image at depth 1.
     """
     chosen = _choose(scene, LensViews.of(views, rows), registered)
@@ -135,7 +146,7 @@ def examine_lens(
     fit = LensFit(views, basis, _blocks(views, len(start.points)), pixel / 5)
     every = _basis(np.arange(len(registered)), int(frames[0]), int(frames[-1]), count)
     found: tuple[Lens, ...] = ()
-    for _ in range(_RESTARTS):
+    for _ in range(_MAX_FITS):
         found, solutions = _compared(fit, start, prior, every)
         if all(lens.log_odds < 0 for lens in found[1:]):
             break
@@ -148,7 +159,7 @@ def examine_lens(
 def _compared(
     fit: LensFit, start: Unknowns, prior: LensPrior, every: np.ndarray
 ) -> tuple[tuple[Lens, ...], list[Unknowns]]:
-    """The ordinary camera and its alternatives, fitted and compared."""
+    """Fits and compares the ordinary camera and its alternatives."""
     num = len(start.lens) - 4
     plain = fit.solve(start, prior.information((), num))
     spread = fit.jackknife(plain, prior.information((), num))
@@ -157,9 +168,9 @@ def _compared(
     found = [_lens((), plain, spread, (0.0, 0.0), every)]
     solutions = [plain]
     simplest = _Simplest.of(fit, (), plain, spread, 0.0)
-    models = (*((name,) for name in _SINGLE), *_PAIRS)
+    models = (*((name,) for name in _SINGLE_DEVIATIONS), *_DEVIATION_PAIRS)
     if prior.focal[0] < prior.focal[1]:
-        models = (OTHER_FOCAL, *models)
+        models = (OTHER_FOCAL_MODEL, *models)
     for model in models:
         likely = [lens.log_odds > 0 and lens.model[0] in model for lens in found[1:]]
         if len(model) > 1 and not any(likely):
@@ -173,7 +184,7 @@ def _compared(
         odds = simplest.log_odds + evidence + prior.log_odds(model)
         found.append(_lens(model, x, own, (evidence, odds), every))
         solutions.append(x)
-        if model == OTHER_FOCAL and odds > 0:
+        if model == OTHER_FOCAL_MODEL and odds > 0:
             simplest = _Simplest.of(fit, model, x, own, odds)
     return tuple(found), solutions
 
@@ -181,10 +192,11 @@ def _compared(
 def _lower(
     fit: LensFit, solutions: list[Unknowns], information: np.ndarray
 ) -> Unknowns | None:
-    """A better fit of the ordinary camera, from the solutions of its alternatives.
+    """Returns a better fit of the ordinary camera, starting from its alternatives, or
+    `None`.
 
     Depth and focal length trade off against each other, so that the ordinary camera has
-    several minima; another model that only led out of a poor one explains nothing.
+    several minima; a model that only left a poor one is no better explanation.
     """
     if not solutions:
         return None
@@ -197,7 +209,7 @@ def _lower(
         lens[[0, 3]] = x.lens[[0, 3]]
         again = fit.solve(dataclasses.replace(x, lens=lens), information)
         new = fit.cost(again, sigma, information)
-        if new < (1 - _MUCH_LOWER) * cost:
+        if new < (1 - _MIN_REFIT_DECREASE) * cost:
             cost, best = new, again
     return best
 
@@ -205,17 +217,18 @@ def _lower(
 def _choose(
     scene: Scene, views: LensViews, registered: np.ndarray
 ) -> tuple[np.ndarray, Unknowns, LensViews] | None:
-    """Frames spread over the video, and what is seen in most of them."""
+    """Chooses frames spread over the video, and the points seen in most of them; `None`
+    if there are too few."""
     frames = np.flatnonzero(registered)
     if len(frames) < 6:
         return None
-    few = np.linspace(0, len(frames) - 1, min(_MOST_FRAMES, len(frames)))
+    few = np.linspace(0, len(frames) - 1, min(_MAX_FRAMES, len(frames)))
     frames = frames[np.unique(few.round().astype(int))]
     views = views[np.flatnonzero(np.isin(views.frame, frames))]
     count = np.bincount(views.landmark, minlength=len(scene.points))
-    points = np.argsort(-count, kind="stable")[:_MOST_POINTS]
+    points = np.argsort(-count, kind="stable")[:_MAX_POINTS]
     points = np.sort(points[count[points] >= 3])
-    if len(points) < _FEWEST_POINTS:
+    if len(points) < _MIN_POINTS:
         return None
     views = views[np.flatnonzero(np.isin(views.landmark, points))]
     views = LensViews(
@@ -231,14 +244,14 @@ def _choose(
 
 
 def _blocks(views: LensViews, count: int) -> Int[np.ndarray, " l"]:
-    """The block of each track: neighbours in the image and in time, by bisection at the
-    median of the widest of the three."""
+    """Returns the block of each track: neighbours in the image and in time, by
+    bisection along the coordinate (u, v, time) of largest spread."""
     seen = np.column_stack([views.xy, views.frame])
     number = np.bincount(views.landmark, minlength=count)[:, None]
     mean = sum_by(views.landmark, seen, count) / np.maximum(number, 1)
     mean = mean / np.maximum(mean.std(axis=0), 1e-12)
     block = np.zeros(count, np.int64)
-    for _ in range(_BISECTIONS):
+    for _ in range(_NUM_BISECTIONS):
         for b in range(int(block.max()) + 1):
             own = np.flatnonzero(block == b)
             widest = int(np.argmax(mean[own].std(axis=0)))
@@ -250,20 +263,20 @@ def _blocks(views: LensViews, count: int) -> Int[np.ndarray, " l"]:
 
 def _knots(frames: Int[np.ndarray, " k"]) -> tuple[int, np.ndarray]:
     span = int(frames[-1] - frames[0])
-    count = int(np.clip(span // _FRAMES_A_KNOT, 1, _MOST_KNOTS))
+    count = int(np.clip(span // _FRAMES_PER_KNOT, 1, _MAX_KNOTS))
     return count, _basis(frames, int(frames[0]), int(frames[-1]), count)
 
 
 def _basis(frames: np.ndarray, first: int, last: int, count: int) -> np.ndarray:
-    """Piecewise linear functions that are 0 in the first frame: (frames, count)."""
+    """Returns piecewise linear functions, 0 in the first frame: (frames, count)."""
     at = np.clip((frames - first) / max(last - first, 1), 0, 1) * count
     return np.maximum(0, 1 - np.abs(at[:, None] - np.arange(1, count + 1)))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Simplest:
-    """The ordinary camera that deviations are compared with: the assumed one, or that
-    of another focal length where a calibration is thought to be wrong."""
+    """The ordinary camera that deviations are compared with: the assumed one, or one of
+    another focal length where a calibration is probably wrong."""
 
     model: tuple[str, ...]
     x: Unknowns
@@ -280,19 +293,19 @@ class _Simplest:
 
 
 def _free(model: tuple[str, ...], num: int) -> np.ndarray:
-    """Indices of the parameters by which a model differs from the ordinary camera."""
+    """Returns the parameters by which a model differs from the ordinary camera."""
     places = {"focal": [0], "aspect": [1], "radial": [2], "zoom": list(range(4, num))}
     return np.array([i for name in model for i in places[name]])
 
 
 def _evidence(model: tuple[str, ...], gain: np.ndarray, spread: Spread) -> float:
-    """Logarithm of the likelihood ratio from that of each held-out block, as if all
-    observations were independent.
+    """Returns the logarithm of the likelihood ratio, from the gain of each held-out
+    block as if all observations were independent.
 
     The jackknife's variance is itself estimated, from as many pieces as there are
     blocks: with it, a normal likelihood becomes Student's.
     """
-    free, freedom = _free(model, len(spread.naive)), len(gain) + TIMES - 2
+    free, freedom = _free(model, len(spread.naive)), len(gain) + NUM_TIME_PIECES - 2
     inside = np.ix_(free, free)
     runs = np.trace(np.linalg.solve(spread.naive[inside], spread.covariance[inside]))
     runs = max(float(runs) / len(free), 1.0)
@@ -308,8 +321,8 @@ def _occam(
     x: Unknowns,
     spread: Spread,
 ) -> float:
-    """Logarithm of the ratio of prior densities at the two solutions, and of the
-    volumes of the posteriors about them (Laplace's approximation)."""
+    """Returns the logarithm of the ratio of prior densities at the two solutions, times
+    that of the posteriors' volumes about them (Laplace's approximation)."""
     free, num = np.union1d(_free(model, len(x.lens)), [0]), len(x.lens) - 4
     data = np.linalg.pinv(spread.covariance[np.ix_(free, free)], hermitian=True)
     parts = []

@@ -2,8 +2,8 @@
 
 The unknowns are cameras, points and the parameters of a lens: the logarithms of the
 focal length and of fx / fy, one radial coefficient, the delay of a rolling shutter, and
-a piecewise linear focal length. `LensFit` finds the most probable ones, and how they
-change when blocks of tracks are left out; `sfm.lens` compares models by it.
+a piecewise linear focal length. `LensFit` estimates them, and their change when blocks
+of tracks are left out, by which `sfm.lens` compares models.
 """
 
 import dataclasses
@@ -16,24 +16,24 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.grouped_sums import sum_by
 from bodyslam_jax.sfm.bundle import ERROR_PER_SIGMA, Views
 
-_CAUCHY = 2.0
+_CAUCHY_SCALE = 2.0
 """Scale of the loss, in standard deviations of an observation."""
-_ITERATIONS, _LEAST_DECREASE, _SMALL = 150, 1e-5, 3
-"""Most iterations, and the relative decrease in cost that ends them if it is as small
-so often in a row: focal length and distortion go along a curved valley."""
-_DAMPING = 1e-6
-"""Initial damping, relative to the diagonal: what a camera's model leaves to be fitted
-has little curvature of its own."""
-_CONSTANT = 4
-"""Parameters of the lens that do not change over time: focal length, aspect, k1 and
-readout; those of the zoom follow."""
-TIMES = 6
-"""Pieces of the video whose frames are left out in turn."""
+_MAX_ITERATIONS, _MIN_DECREASE, _NUM_SMALL_DECREASES = 150, 1e-5, 3
+"""Largest number of iterations, and relative decrease of the cost below which they end
+if it occurs so often in a row: focal length and distortion follow a curved valley."""
+_INITIAL_DAMPING = 1e-6
+"""Initial damping, relative to the diagonal: it is small, as the cost has little
+curvature along the lens's parameters."""
+_NUM_CONSTANT_PARAMETERS = 4
+"""Number of parameters of the lens that are constant over time: focal length, aspect,
+k1 and readout; those of the zoom follow."""
+NUM_TIME_PIECES = 6
+"""Number of pieces of the video whose frames are left out in turn."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LensViews(Views):
-    """Observations, and how a rolling shutter shifts them."""
+    """Observations, with their displacement by a rolling shutter."""
 
     slant: Float[np.ndarray, "m 2"]
     """Displacement by a readout that lasts a frame, at depth 1."""
@@ -45,8 +45,8 @@ class LensViews(Views):
 
     @staticmethod
     def of(views: Views, rows: float) -> "LensViews":
-        """Each point's motion in a frame times its row's delay after the middle row, of
-        an image that is `rows` high at depth 1."""
+        """Computes `slant`: each point's motion in a frame times its row's delay after
+        the middle row, of an image that is `rows` high at depth 1."""
         order = np.lexsort((views.frame, views.landmark))
         xy, frame = views.xy[order], views.frame[order]
         same = np.diff(views.landmark[order]) == 0
@@ -64,11 +64,14 @@ class LensViews(Views):
 
 @dataclasses.dataclass(frozen=True)
 class Unknowns:
+    """Cameras, points and lens of `LensFit`."""
+
     R: Float[np.ndarray, "k 3 3"]
     centre: Float[np.ndarray, "k 3"]
     points: Float[np.ndarray, "l 3"]
     lens: Float[np.ndarray, " g"]
-    """Focal length, aspect, radial, and the zoom at each knot."""
+    """Logarithms of focal length and aspect, k1, readout (frames), and the logarithm of
+    the zoom at each knot."""
 
     def moved(
         self, cameras: np.ndarray, points: np.ndarray, lens: np.ndarray
@@ -86,12 +89,12 @@ class Unknowns:
 
 @dataclasses.dataclass(frozen=True)
 class Spread:
-    """How a solution changes when blocks of tracks are left out."""
+    """Covariance of the lens, and solutions without single blocks of tracks."""
 
     naive: Float[np.ndarray, "g g"]
     """Covariance of the lens if all observations were independent."""
     covariance: Float[np.ndarray, "g g"]
-    """The same by the jackknife."""
+    """Covariance of the lens by the jackknife."""
     without: tuple[Unknowns, ...]
     """The solution without each block."""
 
@@ -112,19 +115,19 @@ class LensFit:
             self.parts.append((points, dataclasses.replace(own, landmark=landmark)))
 
     def sigma(self, x: Unknowns) -> float:
-        """Robust standard deviation of an observation, at depth 1."""
+        """Returns the robust standard deviation of an observation, at depth 1."""
         error = float(np.median(_errors(self.views, self.basis, x)))
         return max(error / ERROR_PER_SIGMA, self.least)
 
     def cost(self, x: Unknowns, sigma: float, information: np.ndarray) -> float:
-        """Twice the negative log-posterior, up to a constant."""
+        """Returns twice the negative log-posterior, up to a constant."""
         loss = _cost(self.views, self.basis, x, sigma).sum()
         return float(loss + (information * x.lens**2).sum())
 
     def solve(self, x: Unknowns, information: np.ndarray) -> Unknowns:
-        """The most probable unknowns, by Levenberg--Marquardt."""
-        damping, small = _DAMPING, 0
-        for _ in range(_ITERATIONS):
+        """Returns the most probable unknowns, by Levenberg--Marquardt."""
+        damping, small = _INITIAL_DAMPING, 0
+        for _ in range(_MAX_ITERATIONS):
             sigma = self.sigma(x)
             system = _linearise(self.views, self.basis, x, sigma)
             cost = self.cost(x, sigma, information)
@@ -141,18 +144,19 @@ class LensFit:
             if better is None:
                 break
             (x, new), damping = better, max(damping / 10, 1e-9)
-            small = small + 1 if cost - new < _LEAST_DECREASE * cost else 0
-            if small == _SMALL:
+            small = small + 1 if cost - new < _MIN_DECREASE * cost else 0
+            if small == _NUM_SMALL_DECREASES:
                 break
         return x
 
     def jackknife(self, x: Unknowns, information: np.ndarray) -> Spread | None:
-        """Solutions without one block each, by one Gauss--Newton step from `x`.
+        """Returns the solutions without one block each, by one Gauss--Newton step from
+        `x`, and the covariance; `None` if a system is singular.
 
         Errors of neighbouring tracks are common to a block; those of all tracks at a
         time (shutter, blur, a map that bends) to a piece of the video. The covariance
-        is the sum of both; without a piece its zoom is not known, so that of a zoom is
-        the first alone.
+        is the sum of both. Without a piece its zoom is unknown, so that the covariance
+        of a zoom is that over blocks alone.
         """
         sigma, num, count = self.sigma(x), len(x.lens), len(x.R)
         reduced = []
@@ -162,7 +166,7 @@ class LensFit:
         S = np.sum([s for s, _ in reduced], axis=0)
         rhs = np.sum([r for _, r in reduced], axis=0)
         systems = [(S - s, rhs - r) for s, r in reduced]
-        for frames in np.array_split(np.arange(count), TIMES):
+        for frames in np.array_split(np.arange(count), NUM_TIME_PIECES):
             rest = self.views[np.flatnonzero(~np.isin(self.views.frame, frames))]
             often = np.bincount(rest.landmark, minlength=len(x.points)) >= 2
             rest = rest[np.flatnonzero(often[rest.landmark])]
@@ -185,14 +189,15 @@ class LensFit:
             without.append(x.moved(cameras, np.zeros_like(x.points), step[-num:]))
         lenses = np.array([step[-num:] for step in steps])
         covariance = _jackknife(lenses[: len(reduced)])
-        constant = np.arange(num) < _CONSTANT
+        constant = np.arange(num) < _NUM_CONSTANT_PARAMETERS
         covariance = covariance + constant[:, None] * constant * _jackknife(
             lenses[len(reduced) :]
         )
         return Spread(naive, covariance, tuple(without))
 
     def held_out(self, spread: Spread, sigma: float) -> np.ndarray:
-        """Cost of each block's observations by cameras and lens of the others."""
+        """Returns the cost of each block's observations by cameras and lens of the
+        others."""
         costs = []
         for (points, views), x in zip(self.parts, spread.without, strict=True):
             x = _located(views, self.basis, x.with_points(x.points[points]), sigma)
@@ -201,7 +206,8 @@ class LensFit:
 
 
 def _newton(S, rhs, information, lens) -> np.ndarray | None:
-    """The step to the minimum of reduced normal equations with the lens' prior."""
+    """Returns the step to the minimum of reduced normal equations with the lens's
+    prior; `None` if they are singular."""
     num, rhs = len(lens), rhs.copy()
     rhs[-num:] += information * lens
     try:
@@ -218,7 +224,8 @@ def _regular(S: np.ndarray, information: np.ndarray) -> np.ndarray:
 
 
 def _inverse(S: np.ndarray, information: np.ndarray) -> np.ndarray | None:
-    """Covariance of the lens by reduced normal equations."""
+    """Returns the covariance of the lens by reduced normal equations, `None`
+    if they are singular."""
     unit = np.eye(len(S))[:, -len(information) :]
     try:
         return cho_solve(cho_factor(_regular(S, information)), unit)[-unit.shape[1] :]
@@ -227,7 +234,8 @@ def _inverse(S: np.ndarray, information: np.ndarray) -> np.ndarray | None:
 
 
 def _jackknife(left_out: Float[np.ndarray, "b g"]) -> Float[np.ndarray, "g g"]:
-    """Covariance of an estimate from those without one of `b` pieces each."""
+    """Returns the covariance of an estimate from those without
+    one of `b` pieces each."""
     away = left_out - left_out.mean(axis=0)
     return (len(away) - 1) / len(away) * away.T @ away
 
@@ -235,7 +243,7 @@ def _jackknife(left_out: Float[np.ndarray, "b g"]) -> Float[np.ndarray, "g g"]:
 def _located(
     views: LensViews, basis: np.ndarray, x: Unknowns, sigma: float
 ) -> Unknowns:
-    """The points that fit best with cameras and lens held, each by itself."""
+    """Fits each point by itself, with cameras and lens held."""
     num = len(x.points)
     cost = sum_by(views.landmark, _cost(views, basis, x, sigma), num)
     damping = np.full(num, 1e-4)
@@ -275,16 +283,16 @@ def _errors(views: LensViews, basis: np.ndarray, x: Unknowns) -> np.ndarray:
 
 
 def _cost(views: LensViews, basis: np.ndarray, x: Unknowns, sigma: float) -> np.ndarray:
-    """Twice the negative log-likelihood of each observation (Cauchy's loss)."""
-    error = _errors(views, basis, x) / sigma / _CAUCHY
-    return _CAUCHY**2 * np.log1p(error**2)
+    """Returns twice the negative log-likelihood of each observation (Cauchy loss)."""
+    error = _errors(views, basis, x) / sigma / _CAUCHY_SCALE
+    return _CAUCHY_SCALE**2 * np.log1p(error**2)
 
 
 def _jacobians(v: LensViews, basis: np.ndarray, x: Unknowns, sigma: float):
-    """Whitened residuals and their derivatives by camera, point and lens."""
+    """Returns whitened residuals and their derivatives by camera, point and lens."""
     p_C, front, z, q, r2, size, predicted, radial = _predict(v, basis, x)
     r = (predicted + x.lens[3] * v.slant - v.xy) / sigma
-    weight = front / (1 + (r**2).sum(axis=-1) / _CAUCHY**2)
+    weight = front / (1 + (r**2).sum(axis=-1) / _CAUCHY_SCALE**2)
     root = np.sqrt(weight)[:, None, None]
     D = np.zeros((len(z), 2, 2))
     D[:, 0, 0] = D[:, 1, 1] = radial
@@ -311,7 +319,7 @@ def _jacobians(v: LensViews, basis: np.ndarray, x: Unknowns, sigma: float):
 
 
 def _points_system(views: LensViews, basis: np.ndarray, x: Unknowns, sigma: float):
-    """Normal equations of each point alone."""
+    """Returns the normal equations of each point alone."""
     _, B, _, r = _jacobians(views, basis, x, sigma)
     num = len(x.points)
     V = sum_by(views.landmark, np.einsum("mki,mkj->mij", B, B), num)
@@ -319,7 +327,7 @@ def _points_system(views: LensViews, basis: np.ndarray, x: Unknowns, sigma: floa
 
 
 def _linearise(v: LensViews, basis: np.ndarray, x: Unknowns, sigma: float):
-    """Normal equations: of cameras and lens, of points, and between them."""
+    """Returns the normal equations of cameras with lens, points, and between them."""
     A, B, G, r = _jacobians(v, basis, x, sigma)
     k, l = len(x.R), len(x.points)
     V = sum_by(v.landmark, np.einsum("mki,mkj->mij", B, B), l)
@@ -349,7 +357,7 @@ def _linearise(v: LensViews, basis: np.ndarray, x: Unknowns, sigma: float):
 
 
 def _reduce(system, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Normal equations of cameras and lens with the points eliminated."""
+    """Returns the normal equations of cameras and lens, with points eliminated."""
     U, V, M, g, g_p = system
     flat = M.reshape(-1, len(U))
     V = V * (1 + damping * np.eye(3))
@@ -359,7 +367,7 @@ def _reduce(system, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _step(system, damping: float, information: np.ndarray, lens: np.ndarray):
-    """The damped step of cameras, points and lens; `None` if it is not determined."""
+    """Returns the damped step of cameras, points and lens; `None` if it is singular."""
     U, V, M, _, g_p = system
     width, num = len(U), len(lens)
     S, rhs = _reduce(system, damping)

@@ -1,4 +1,4 @@
-"""Loop closure: tracks that observe one and the same point of the map are joined.
+"""Loop closure: joins tracks that observe the same point of the map.
 
 A point tracker begins a new track where a lost point comes back into view. Without loop
 closure a camera that turns away and back maps the same scene twice, and the scale of
@@ -17,25 +17,26 @@ from bodyslam_jax.sfm.bundle import (
 )
 from bodyslam_jax.sfm.relocalise import Pose, near, relocate, with_moved
 
-_LEAST_VIEWS, _MOST_VIEWS = 2, 8
-"""Registered frames in which a track must be observed; the most that are tested."""
-_WIDE = 10.0
+_MIN_VIEWS, _MAX_VIEWS = 2, 8
+"""Least number of registered frames in which a track is observed; largest number of
+those that are tested."""
+_MAX_DRIFT = 10.0
 """Largest drift of the map, in thresholds, that is searched."""
-_REACH = 2.0
-"""Error, in thresholds, up to which a landmark is a candidate: those with little
-parallax have inaccurate positions."""
-_FITS = 0.7
-"""Mean error, in thresholds, of a point that explains two tracks."""
-_RIVAL = 1.5
-"""Times the error of the best point that the next best must have."""
+_MAX_CANDIDATE_ERROR = 2.0
+"""Largest error, in thresholds, of a candidate landmark: those with little parallax
+have inaccurate positions."""
+_MAX_JOINT_ERROR = 0.7
+"""Largest mean error, in thresholds, of a point that explains two tracks."""
+_MIN_RIVAL_RATIO = 1.5
+"""Least ratio of the error of the second-best point to that of the best."""
 
 
 class Revisits:
-    """Which tracks observe the same point, and the landmark that each belongs to."""
+    """Tracks that observe the same point, and the landmark that each belongs to."""
 
     def __init__(self, views: Views, num_tracks: int):
         self.track = views.landmark.copy()
-        """Of each observation; `views.landmark` becomes the landmark's number."""
+        """Track of each observation; `views.landmark` becomes the landmark's number."""
         self.views = views
         self.members: dict[int, list[int]] = {}
         """Tracks of each landmark that has more than one, its own number first."""
@@ -47,7 +48,7 @@ class Revisits:
         ]
 
     def views_of(self, landmark: int) -> Int[np.ndarray, " m"]:
-        """All observations of a landmark, whatever tracks they belong to."""
+        """Returns all observations of a landmark, whatever tracks they belong to."""
         tracks = self.members.get(landmark, [landmark])
         return np.concatenate([self._of_track[t] for t in tracks])
 
@@ -60,8 +61,8 @@ class Revisits:
         registered: Bool[np.ndarray, " t"],
         threshold: float,
     ) -> tuple[list[tuple[int, int]], float]:
-        """Pairs of landmarks (one, other) that may be the same point: `one` is observed
-        in `frame`, `other` is not but projects to the same pixel.
+        """Finds pairs of landmarks (one, other) that may be the same point: `one` is
+        observed in `frame`, `other` is not but projects to the same pixel.
 
         The second value is the drift of the map between the two, as an error at
         depth 1.
@@ -76,19 +77,19 @@ class Revisits:
         others[observed] = False
         others = np.flatnonzero(others)
         rows = {int(i): self._some_views(int(i), registered) for i in observed}
-        fresh = [i for i, r in rows.items() if len(r) >= _LEAST_VIEWS]
+        fresh = [i for i, r in rows.items() if len(r) >= _MIN_VIEWS]
         if not len(others) or not fresh:
             return [], 0.0
         at = [self.views_of(i) for i in fresh]
         xy = np.array([self.views.xy[r[self.views.frame[r] == frame][0]] for r in at])
         points = scene.points[others]
         pose: Pose = (scene.R_CW[frame], scene.centre[frame])
-        i, j = near(points, xy, pose, _WIDE * threshold)
-        found, away = relocate(points[j], xy[i], i, pose, threshold, 1 / _WIDE**2)
+        i, j = near(points, xy, pose, _MAX_DRIFT * threshold)
+        found, away = relocate(points[j], xy[i], i, pose, threshold, 1 / _MAX_DRIFT**2)
         if found is None:
             return [], 0.0
         pose = found
-        i, j = near(points, xy, pose, _REACH * threshold)
+        i, j = near(points, xy, pose, _MAX_CANDIDATE_ERROR * threshold)
         pairs = [
             (fresh[a], int(others[b]))
             for a, b in zip(i, j, strict=True)
@@ -101,11 +102,12 @@ class Revisits:
     def _some_views(
         self, landmark: int, registered: np.ndarray
     ) -> Int[np.ndarray, " m"]:
-        """Observations in registered frames, spread over them; no more than a few."""
+        """Returns up to `_MAX_VIEWS` observations, spread over
+        the registered frames."""
         rows = self.views_of(landmark)
         rows = rows[registered[self.views.frame[rows]]]
-        if len(rows) > _MOST_VIEWS:
-            rows = rows[np.linspace(0, len(rows) - 1, _MOST_VIEWS).round().astype(int)]
+        if len(rows) > _MAX_VIEWS:
+            rows = rows[np.linspace(0, len(rows) - 1, _MAX_VIEWS).round().astype(int)]
         return rows
 
     def _misfit(
@@ -115,14 +117,15 @@ class Revisits:
         registered: np.ndarray,
         threshold: float,
     ) -> Float[np.ndarray, " p"]:
-        """Mean reprojection error of the point triangulated from both of a pair, of the
-        one of the two that it fits worse; in thresholds, each error clipped at 3."""
+        """Returns the mean reprojection error of the point triangulated from both of a
+        pair, for the one of the two that it fits worse; in thresholds, each error
+        clipped at 3."""
         if not pairs:
             return np.zeros(0)
         parts = [self._some_views(i, registered) for pair in pairs for i in pair]
         part = np.repeat(np.arange(len(parts)), [len(rows) for rows in parts])
         rows = np.concatenate(parts)
-        # The first of a pair is seen by the cameras that were moved.
+        # The first of a pair is observed by the moved cameras.
         frame = self.views.frame[rows] + (part % 2 == 0) * (len(both.centre) // 2)
         views = Views(frame, part // 2, self.views.xy[rows])
         points = triangulate(
@@ -141,16 +144,16 @@ class Revisits:
     def _one_each(
         self, pairs: list[tuple[int, int]], misfit: np.ndarray
     ) -> list[tuple[int, int]]:
-        """The best pairs that are unambiguous and after which no landmark is observed
-        twice in one frame."""
+        """Returns the best pairs that are unambiguous and after which no landmark is
+        observed twice in one frame."""
         rated: dict[int, list[tuple[float, int]]] = {}
         for (i, j), m in zip(pairs, misfit, strict=True):
             rated.setdefault(i, []).append((float(m), j))
         best = []
         for i, found in rated.items():
             found.sort()
-            is_clear = len(found) == 1 or found[1][0] >= _RIVAL * found[0][0]
-            if found[0][0] <= _FITS and is_clear:
+            is_clear = len(found) == 1 or found[1][0] >= _MIN_RIVAL_RATIO * found[0][0]
+            if found[0][0] <= _MAX_JOINT_ERROR and is_clear:
                 best.append((found[0][0], i, found[0][1]))
         taken: set[int] = set()
         chosen = []
@@ -171,12 +174,12 @@ class Revisits:
         return rows
 
     def part(self, error: Float[np.ndarray, " m"]) -> list[int]:
-        """Separates joined tracks again whose reprojection error is too large.
+        """Separates joined tracks again whose reprojection error is too large, and
+        returns them: they are landmarks of their own again.
 
         Args:
-            error: of each observation, in thresholds; NaN where it has none.
-
-        Returns: these tracks, which are landmarks of their own again.
+            error: reprojection error of each observation, in thresholds; NaN where it
+                has none.
         """
         loose = []
         for landmark, tracks in list(self.members.items()):
@@ -184,7 +187,7 @@ class Revisits:
                 rows = self._of_track[track]
                 found = np.minimum(error[rows], 3.0)
                 found = found[~np.isnan(found)]
-                if len(found) and found.mean() > _FITS:
+                if len(found) and found.mean() > _MAX_JOINT_ERROR:
                     tracks.remove(track)
                     self.views.landmark[self._of_track[track]] = track
                     self.refused.add((track, landmark))

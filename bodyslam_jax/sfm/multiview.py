@@ -1,4 +1,4 @@
-"""Two views, many rays, one pose: the geometry that a reconstruction grows by."""
+"""Relative pose, rotation and resection of calibrated views."""
 
 import cv2
 import numpy as np
@@ -10,9 +10,10 @@ from bodyslam_jax.geometry import so3_numpy as so3
 def relative_pose(
     xy_a: Float[np.ndarray, "n 2"], xy_b: Float[np.ndarray, "n 2"], threshold: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Rotation R_BA (3, 3), direction of A's centre in B (3,) and inliers (n,).
+    """Returns the rotation R_BA (3, 3), the direction of A's centre in B (3,) and the
+    inliers (n,), or `None`.
 
-    Five-point RANSAC, then the decomposition with most points in front.
+    It is five-point RANSAC, and the decomposition with most points in front.
     """
     E, inlier = cv2.findEssentialMat(
         xy_a, xy_b, np.eye(3), cv2.USAC_MAGSAC, 0.9999, threshold, 2000
@@ -31,11 +32,11 @@ def planar_poses(
     threshold: float,
     share: float,
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Poses as of `relative_pose` if a plane explains the share of the points.
+    """Returns poses as `relative_pose` does, if a plane explains a share of the points.
 
-    The homography of a plane decomposes into two poses that have all points in front: a
-    translation along the plane, say, and a turn with a translation across it (Faugeras
-    & Lustman, IJPRAI 1988). Two views do not tell them apart, a third does.
+    The homography of a plane decomposes into two poses with all points in front, such
+    as a translation along the plane, and a rotation with a translation across it
+    (Faugeras & Lustman, IJPRAI 1988). Two views cannot distinguish them, a third can.
     """
     H, inlier = cv2.findHomography(xy_a, xy_b, cv2.USAC_MAGSAC, threshold)
     if H is None or inlier is None or inlier.mean() < share:
@@ -54,10 +55,11 @@ def planar_poses(
 def fit_rotation(
     ray_a: Float[np.ndarray, "n 3"], ray_b: Float[np.ndarray, "n 3"], scale: float
 ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " n"]]:
-    """Robust rotation R with `ray_b = R ray_a`, and the angles that remain (rad).
+    """Estimates the robust rotation R with `ray_b = R ray_a`; returns it with the
+    residual angles (rad).
 
     Args:
-        scale: angle from which a pair is doubted, rad (Cauchy).
+        scale: scale of the Cauchy loss, rad.
     """
     R, away = np.eye(3), np.zeros(len(ray_a))
     for _ in range(10):
@@ -74,9 +76,10 @@ def resect(
     threshold: float,
     guess: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, " n"]] | None:
-    """Camera (R_CW, centre) that sees `points` at `xy`, and which of them fit.
+    """Returns the camera (R_CW, centre) that sees `points` at `xy`, and which of them
+    fit, or `None`.
 
-    Starts from `guess` if that explains most of the points, else from RANSAC.
+    It starts from `guess` if that explains most of the points, else from RANSAC.
     """
     if len(points) < 6:
         return None
@@ -98,7 +101,7 @@ def resect(
             confidence=0.9999,
             flags=cv2.SOLVEPNP_SQPNP,
         )
-    except cv2.error:  # SQPnP gives up at a sample whose points coincide.
+    except cv2.error:  # SQPnP fails for a sample whose points coincide.
         return None
     if not ok or inlier is None or len(inlier) < 6:
         return None
@@ -126,7 +129,7 @@ def refine_pose(
     xy: np.ndarray,
     threshold: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Iteratively reweighted Gauss--Newton on one pose; None if it runs away."""
+    """Refines a pose by reweighted Gauss--Newton; `None` if it diverges."""
     start_z = np.median((points - centre) @ R[2])
     for _ in range(10):
         p_C = (points - centre) @ R.T

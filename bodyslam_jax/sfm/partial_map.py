@@ -1,4 +1,4 @@
-"""A map while it grows: triangulation, inliers, bundle adjustment, joined tracks."""
+"""A growing map: triangulation, inliers, bundle adjustment, joined tracks."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,25 +11,28 @@ from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
 from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
 from bodyslam_jax.sfm.loop_closure import Revisits
 
-_OUTLIER = 2.0
+_OUTLIER_ERROR_PX = 2.0
 """Reprojection error beyond which an observation is an outlier, px: 4 σ of an assumed
 tracking noise of 0.5 px at 640x480; not scaled with the image, but `Builder.build`
 doubles it up to twice where that gives more inliers."""
-_LEAST_ANGLE = 0.5
+_MIN_ANGLE_DEG = 0.5
 """Smallest angle between the rays of a point, degrees; smaller ones are tried where
 cameras cannot be located otherwise."""
-_ENOUGH = 20
-"""Observations of triangulated points from which the usual distance is estimated."""
-_FLAT = 0.5
-"""Share of the smallest angle that a point may itself have."""
-_DRIFTED = 1.0
-"""Drift at a revisited point, in thresholds, from which the loop is closed at once."""
-_CLOSING = (8.0, 3.0)
+_MIN_DISTANCE_OBSERVATIONS = 20
+"""Least number of observations of triangulated points by which their median distance is
+estimated."""
+_MIN_OWN_ANGLE_SHARE = 0.5
+"""Least angle of a point at its triangulated position, as a share of the smallest
+angle."""
+_MIN_DRIFT = 1.0
+"""Least drift at revisited points, in thresholds, for which the loop is closed at
+once."""
+_CLOSING_LOSSES_PX = (8.0, 3.0)
 """Scales of the loss in successive adjustments, px: wide at first, so that the joined
 tracks are not rejected as outliers."""
-_ROUNDS, _SETTLED = 6, 0.01
-"""Most rounds of joining and separating tracks, and the share of observations that
-change their landmark below which the rounds end."""
+_MAX_ROUNDS, _MAX_SETTLED_SHARE = 6, 0.01
+"""Largest number of rounds of joining and separating tracks, and the share of
+observations that change their landmark below which the rounds end."""
 
 Refine = Callable[[Scene, Views, Bool[np.ndarray, " t"]], None]
 """Adjusts the free cameras and all points of `views` in place, as `bundle.adjust`."""
@@ -66,8 +69,8 @@ class Mapper:
         self.joining = False
         self.num_frames, self.num_landmarks = num_frames, num_landmarks
         self.pixel: float = 1 / focal
-        self.threshold: float = _OUTLIER / focal
-        self.min_angle = np.radians(_LEAST_ANGLE)
+        self.threshold: float = _OUTLIER_ERROR_PX / focal
+        self.min_angle = np.radians(_MIN_ANGLE_DEG)
         self.refine = refine or self._adjust
         order = np.argsort(views.frame, kind="stable")
         bounds = np.searchsorted(views.frame[order], np.arange(num_frames + 1))
@@ -79,7 +82,7 @@ class Mapper:
         adjust(scene, views, free, loss=self.pixel, iterations=10, tolerance=1e-3)
 
     def _join(self, grown: PartialMap, k: int) -> None:
-        """Finds points of the map again among those that frame `k` sees."""
+        """Joins points of frame `k` with points of the map that they revisit."""
         if not self.joining:
             return
         observed = self.views.landmark[self.of_frame[k]]
@@ -90,29 +93,29 @@ class Mapper:
             rows = self.revisits.join(one, other)
             grown.has_point[one] = False
             grown.inlier[rows] = grown.registered[self.views.frame[rows]]
-        if pairs and away > _DRIFTED * self.threshold:
+        if pairs and away > _MIN_DRIFT * self.threshold:
             self._close(grown)
 
     def _settle(self, grown: PartialMap, frames: np.ndarray) -> None:
-        """Joins and separates tracks until little changes: false joins show once the
-        map is less distorted."""
-        for turn in range(_ROUNDS):
+        """Joins and separates tracks until few observations change: false joins become
+        apparent once the map is less distorted."""
+        for turn in range(_MAX_ROUNDS):
             if not self.revisits.members:
                 return
             before = self.views.landmark.copy()
             self._close(grown)
-            # A track is seen from several keyframes: every other one will do.
+            # A track is seen from several keyframes: every other one suffices.
             for k in frames[turn % 2 :: 2]:
                 self._join(grown, int(k))
             self._refine(grown, self._free(grown))
             self.make_points(grown, self._views_of(grown))
-            if np.mean(self.views.landmark != before) < _SETTLED:
+            if np.mean(self.views.landmark != before) < _MAX_SETTLED_SHARE:
                 return
 
     def _close(self, grown: PartialMap) -> None:
         """Distributes the drift over the loop by bundle adjustment."""
         use = np.flatnonzero(grown.inlier & grown.registered[self.views.frame])
-        for loss in _CLOSING:
+        for loss in _CLOSING_LOSSES_PX:
             adjust(
                 grown.scene,
                 self.views[use],
@@ -126,7 +129,7 @@ class Mapper:
         return np.flatnonzero(grown.registered[self.views.frame])
 
     def _views_seen_in(self, grown: PartialMap, k: int) -> np.ndarray:
-        """All observations of the points in frame `k` that are not triangulated yet."""
+        """Returns all observations of points of frame `k` that have no position."""
         wanted = np.zeros(self.num_landmarks, dtype=bool)
         wanted[self.views.landmark[self.of_frame[k]]] = True
         wanted &= ~grown.has_point
@@ -156,7 +159,11 @@ class Mapper:
             return
         observed = views[np.flatnonzero(good)]
         angle = widest_angle(trial.centre[observed.frame], observed.landmark, points)
-        new = (fits >= 2) & (fits >= 0.6 * count) & (angle > _FLAT * self.min_angle)
+        new = (
+            (fits >= 2)
+            & (fits >= 0.6 * count)
+            & (angle > _MIN_OWN_ANGLE_SHARE * self.min_angle)
+        )
         new &= self._parallax(trial, observed, grown) > self.min_angle
         grown.scene.points[new] = points[new]
         grown.has_point |= new
@@ -164,15 +171,15 @@ class Mapper:
         grown.inlier[use[kept]] = good[kept]
 
     def _parallax(self, trial: Scene, views: Views, grown: PartialMap) -> np.ndarray:
-        """Parallax (rad) of each landmark if it were at the median distance of the
+        """Returns the parallax (rad) of each landmark at the median distance of the
         points that the same cameras observe.
 
-        The parallax at the triangulated point itself would select points that noise has
-        drawn nearer: the map would shrink as it grows.
+        The parallax at the triangulated point itself would select points that are too
+        near because of noise: the map would shrink as it grows.
         """
         near = np.isin(np.arange(self.num_frames), views.frame)
         at = grown.has_point[self.views.landmark] & near[self.views.frame]
-        if np.count_nonzero(at) < _ENOUGH:
+        if np.count_nonzero(at) < _MIN_DISTANCE_OBSERVATIONS:
             return widest_angle(trial.centre[views.frame], views.landmark, trial.points)
         triangulated = self.views[np.flatnonzero(at)]
         centres = grown.scene.centre[triangulated.frame]
@@ -196,7 +203,7 @@ class Mapper:
         of_all = np.full(len(self.views.frame), np.nan)
         of_all[use] = error
         if self.revisits.part(of_all):
-            # Tracks that are their own again have no point yet.
+            # Separated tracks have no point yet.
             still = grown.has_point[self.views.landmark[use]]
             grown.inlier[use[~still]] = False
             use, good = use[still], good[still]
@@ -207,12 +214,16 @@ class Mapper:
         angle = widest_angle(
             grown.scene.centre[fitting.frame], fitting.landmark, grown.scene.points
         )
-        bad = (fits < 2) | (fits < 0.5 * count) | (angle < _FLAT * self.min_angle)
+        bad = (
+            (fits < 2)
+            | (fits < 0.5 * count)
+            | (angle < _MIN_OWN_ANGLE_SHARE * self.min_angle)
+        )
         grown.has_point &= ~bad
         grown.inlier &= grown.has_point[self.views.landmark]
 
     def _free(self, grown: PartialMap) -> np.ndarray:
-        """All registered cameras but the first, which holds the frame in place."""
+        """Returns all registered cameras but the first, which fixes the world frame."""
         free = grown.registered.copy()
         free[np.argmax(free)] = False
         return free
@@ -225,7 +236,7 @@ class Mapper:
     def _refine(self, grown: PartialMap, free: np.ndarray) -> None:
         use = np.flatnonzero(grown.inlier & grown.registered[self.views.frame])
         if not free.all():
-            # Points that no free camera sees would only cost time.
+            # Points that no free camera sees are left out, to save time.
             touched = np.zeros(self.num_landmarks, dtype=bool)
             touched[self.views.landmark[use[free[self.views.frame[use]]]]] = True
             use = use[touched[self.views.landmark[use]]]

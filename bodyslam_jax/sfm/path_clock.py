@@ -1,9 +1,9 @@
-"""The clock of a given camera path: the offset from the video's, found from tracks.
+"""The offset of the clock of a given camera path from the video's, by tracks.
 
 Where the times of a path are not those of the video, the offset between the two is the
 one at which the tracks fit the path best (`given_path.PathTest`). Its standard
 deviation is that of the jackknife over blocks of time, because errors of neighbouring
-frames are correlated; an offset that fits as well as another is no result.
+frames are correlated; an offset that fits no better than another is rejected.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera.path import at_times, usual_step
 from bodyslam_jax.sfm.given_path import (
-    MIN_TESTED,
+    MIN_TESTED_OBSERVATIONS,
     MIN_VIEWS,
     PathTest,
     is_worse,
@@ -24,46 +24,48 @@ from bodyslam_jax.sfm.given_path import (
 from bodyslam_jax.types import CameraPath, Intrinsics, PathClock, Tracks
 
 _MAX_OFFSETS = 1500
-"""Offsets of the coarse search; it is by frames, or by several in long videos."""
-_LEAST_OVERLAP = 0.5
-"""Share of the shorter of path and video that lies within the other."""
+"""Largest number of offsets of the coarse search, in steps of a frame, or of several in
+long videos."""
+_MIN_OVERLAP = 0.5
+"""Least share of the shorter of path and video that lies within the other."""
 _LOCAL_FRAMES = 15
-"""Frames before and after the given time within which a path on the video's own clock
-is compared with itself."""
-_SIGNIFICANT = 3.0
-"""Standard errors beyond which an offset differs from another."""
-_AS_EXPECTED = 0.95
-"""Share of the expected fit from which no other reading of the times is tried."""
-_WHOLE_RATE = 0.005
-"""Relative difference up to which the step of a path is of whole frames, so that it was
-made from the frames of this video."""
-_NEAR_RATE = 0.05
-"""Relative difference of rates up to which a tracker may have assumed another frame
-rate than the video's without any part of the path showing it."""
-_PHASES = 4
-"""Offsets per frame in the refinement."""
+"""Number of frames before and after the given time within which other offsets of a path
+on the video's own clock are tried."""
+_SIGNIFICANCE_SIGMAS = 3.0
+"""Number of standard errors beyond which two offsets differ."""
+_MIN_EXPECTED_SHARE = 0.95
+"""Least share of the expected fit at which no other reading of the times is tried."""
+_MAX_WHOLE_RATE_ERROR = 0.005
+"""Largest relative difference of a path's step from a whole number of frames, for a
+path that was made from the frames of this video."""
+_MAX_ASSUMED_RATE_ERROR = 0.05
+"""Largest relative difference of rates at which a tracker may have assumed another
+frame rate than the video's without any part of the path showing it."""
+_NUM_PHASES = 4
+"""Number of offsets per frame in the refinement."""
 _NOISE_EFFECT = 0.02
-"""Share of the rise of the cost over a frame by which smoother poses lower it, from
+"""Least decrease of the cost by smoother poses, as a share of its rise over a frame, at
 which the noise of the path makes the cost depend on the phase of poses and frames."""
-_SAME_PATH = 0.05, 0.02
-"""RMS difference of positions, of the path's extent, and of rotations (rad) up to which
-offsets that fit equally give the same path."""
+_SAME_PATH_TOLERANCES = 0.05, 0.02
+"""Largest RMS difference of positions, relative to the path's extent, and of rotations
+(rad), at which offsets that fit equally well give the same path."""
 _LOST_PENALTY = 0.02
-"""Share of the cost by which a step of the offset must lower it."""
+"""Least decrease of the cost by a step of the offset, as a share of it."""
 _PIECE_FRAMES = 10
-"""Frames of the pieces of tracks between which steps of the offset are sought."""
+"""Length, in frames, of the pieces of tracks between which steps of the offset are
+sought."""
 _FOCAL_FACTORS = (0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5)
-"""Factors of a guessed focal length under which a path is tried: fields of view from 31
+"""Factors on a guessed focal length with which a path is tried: fields of view from 31
 to 70 degrees around the guess of 45 degrees."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Placed:
-    """A path whose poses have been put on the frames of the video."""
+    """A path whose poses are on the clock of the video's frames."""
 
     path: CameraPath
     intrinsics: Intrinsics
-    """With the focal length under which the path fits, if it was a guess."""
+    """Intrinsics, with the focal length that fits the path if it was a guess."""
     warnings: tuple[str, ...]
 
 
@@ -73,14 +75,14 @@ def place_in_time(
     intrinsics: Intrinsics,
     timestamps: Float[np.ndarray, " t"],
 ) -> Placed:
-    """Puts the poses of a path on the frames at which the tracks fit them.
+    """Converts the poses of a path to the clock of the video, by the tracks.
 
-    A path on the video's own clock stays where it is, unless another time fits
-    significantly better. Of any other path the offset, and frames lost on the way, are
-    found from the tracks.
+    A path on the video's own clock is kept, unless another offset fits significantly
+    better. For any other path the offset, and lost frames in between, are estimated
+    from the tracks.
 
     Args:
-        timestamps: of the frames, s.
+        timestamps: times of the frames, s.
 
     **Raises:** `InputError` if the clock is not the video's and its offset cannot be
     found.
@@ -90,13 +92,14 @@ def place_in_time(
     test = PathTest(tracks, intrinsics, len(timestamps))
     most = int(test.used.sum())
     given = path.clocks[0]
-    if most < MIN_TESTED:
+    if most < MIN_TESTED_OBSERVATIONS:
         if given.is_videos:
             return Placed(path, intrinsics, ())
         raise InputError(
             f"camera path: its clock is not the video's ({given.name}), and {most} "
-            f"observations of background points, expected {MIN_TESTED} or more, do not "
-            "tell the offset: give its times in seconds from the video's first frame."
+            f"observations of background points, expected {MIN_TESTED_OBSERVATIONS} or "
+            "more, do not tell the offset: give its times in seconds from the video's "
+            "first frame."
         )
     warnings: list[str] = []
     search = _Search(test, path.poses, timestamps)
@@ -167,17 +170,17 @@ class _Found:
 
     clock: PathClock
     times: Float[np.ndarray, " n"]
-    """Of the poses on the video's clock, s."""
+    """Times of the poses on the video's clock, s."""
     sigma: float
-    """Of the offset, s."""
+    """Standard deviation of the offset, s."""
     is_given: bool = False
-    """Whether the times are those of the file."""
+    """Whether the times are those in the file."""
     lost: tuple[tuple[float, int], ...] = ()
-    """Times (s) before which poses of frames are missing, and of how many frames."""
+    """Times (s) before which poses are missing, each with the number of frames."""
 
 
 class _Search:
-    """Offsets of one path, tested against one sample of tracks."""
+    """Tests offsets of one path against one sample of tracks."""
 
     def __init__(
         self,
@@ -189,15 +192,15 @@ class _Search:
         self.period = usual_step(timestamps)
 
     def path(self, times: Float[np.ndarray, " n"], path: CameraPath) -> CameraPath:
-        """The path with its poses at `times` of the video's clock."""
+        """Returns the path with its poses at `times` of the video's clock."""
         T_WC, known = at_times(times, self.poses, self.timestamps)
         return dataclasses.replace(path, T_WC=T_WC, known=known, poses=None, clocks=())
 
     def costs(
         self, times: Float[np.ndarray, " n"], *, bridged: bool = True
     ) -> Float[np.ndarray, "b 2"]:
-        """As `PathTest.cost`, with the poses at `times`; if not `bridged`, without the
-        frames of which neighbouring poses are missing."""
+        """Returns `PathTest.cost` with the poses at `times`; if not `bridged`, without
+        frames whose neighbouring poses are missing."""
         T_WC, known = at_times(times, self.poses, self.timestamps)
         if not bridged:
             away = np.abs(self.timestamps[:, None] - times).min(1)
@@ -205,14 +208,15 @@ class _Search:
         return self.test.cost(self.test.errors(T_WC, known))
 
     def offsets(self, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
-        """Offsets, s, at which path and video overlap enough, by whole frames."""
+        """Returns offsets, s, by whole frames, with enough
+        overlap of path and video."""
         start, end = self.timestamps[0], self.timestamps[-1]
         length = min(times[-1] - times[0], end - start)
-        shortest = max(_LEAST_OVERLAP * length, MIN_VIEWS * self.period)
+        shortest = max(_MIN_OVERLAP * length, MIN_VIEWS * self.period)
         low = start + shortest - times[-1]
         high = end - shortest - times[0]
         step = max(1, int((high - low) / self.period / _MAX_OFFSETS) + 1) * self.period
-        # Through the first frame and pose together.
+        # The grid contains the offset at which the first frame and pose coincide.
         first = np.ceil((low - (start - times[0])) / step)
         last = np.floor((high - (start - times[0])) / step)
         return start - times[0] + step * np.arange(first, last + 1)
@@ -225,30 +229,30 @@ class _Search:
     def refined(
         self, times: Float[np.ndarray, " n"], offset: float
     ) -> tuple[float, float]:
-        """The offset of least cost near `offset`, and its sigma, both in s.
+        """Returns the offset of least cost near `offset`, and its sigma, both in s.
 
         Interpolation between poses averages their noise, most in the middle between
         two, so that the cost of a noisy path also depends on the phase of frames and
         poses: then a parabola plus a constant for each phase is fitted, else a narrow
         parabola.
         """
-        phases = np.arange(-2 * _PHASES, 2 * _PHASES + 1)
+        phases = np.arange(-2 * _NUM_PHASES, 2 * _NUM_PHASES + 1)
         one = np.zeros(len(phases), int)
-        at = offset + phases * self.period / _PHASES
+        at = offset + phases * self.period / _NUM_PHASES
         profile = self.profile(times, at)
         if self._is_noisy(times + _minimum(at, profile, one)[0]):
-            offset, sigma = _minimum(at, profile, phases % _PHASES)
+            offset, sigma = _minimum(at, profile, phases % _NUM_PHASES)
         else:
             offset, sigma = _minimum(at, profile, one)
             for step in (0.25, 0.1):
                 at = offset + step * self.period * np.arange(-4, 5)
                 offset, sigma = _minimum(at, self.profile(times, at), one[:9])
-        # Below a hundredth of a frame exposures and read-out matter.
+        # Exposure and readout limit the accuracy to a hundredth of a frame.
         return offset, max(sigma, 0.01 * self.period)
 
     def _is_noisy(self, times: Float[np.ndarray, " n"]) -> bool:
-        """Whether the tracks fit better if each pose is averaged with its neighbours,
-        by more than a small part of what a frame's offset costs."""
+        """Returns True if averaging each pose with its neighbours lowers the cost, by
+        more than a small share of its rise over an offset of one frame."""
         T_WC = self.poses.copy()
         T_WC[1:-1] = (self.poses[:-2] + 2 * self.poses[1:-1] + self.poses[2:]) / 4
         U, _, Vt = np.linalg.svd(T_WC[:, :3, :3])
@@ -261,9 +265,12 @@ class _Search:
     def equally_good(
         self, found: _Found
     ) -> tuple[_Found, tuple[float, float] | None, bool]:
-        """Times (s) of the first pose that fit as well as the one found, if they span
-        more than the sigma claims; and whether they all give the same path. Of these
-        the one with poses for most points is returned."""
+        """Looks for other offsets that fit as well as the one found.
+
+        Returns the one of them with poses for most points, the range of the times (s)
+        of the first pose (`None` if the offset is unique), and whether they all give
+        the same path.
+        """
         times = found.times
         offsets = self.offsets(times)
         offsets = offsets[np.abs(offsets) > max(3 * found.sigma, 1.5 * self.period)]
@@ -279,8 +286,8 @@ class _Search:
         return moved, range_, all(one is not False for one in same) and any(same)
 
     def _same(self, one: np.ndarray, other: np.ndarray) -> bool | None:
-        """Whether poses at two series of times give one path, up to a rigid motion;
-        `None` if they have too few frames in common."""
+        """Returns whether poses at two series of times give one path, up to a rigid
+        motion; `None` if they have too few frames in common."""
         a, known_a = at_times(one, self.poses, self.timestamps)
         b, known_b = at_times(other, self.poses, self.timestamps)
         both = known_a & known_b
@@ -296,14 +303,17 @@ class _Search:
         away = centres - (b[:, :3, 3] - b[:, :3, 3].mean(0)) @ R.T
         rms = lambda v: float(np.sqrt((v**2).sum(-1).mean()))
         extent = max(rms(centres), 1e-12)
-        return rms(away) < _SAME_PATH[0] * extent and rms(turned) < _SAME_PATH[1]
+        return (
+            rms(away) < _SAME_PATH_TOLERANCES[0] * extent
+            and rms(turned) < _SAME_PATH_TOLERANCES[1]
+        )
 
 
 def _best_clock(search: _Search, clocks: tuple[PathClock, ...]) -> _Found | None:
-    """The clock and offset that fit best; the given one if none fits better.
+    """Returns the clock and offset that fit best; the given one if none fits better.
 
     Other clocks than the first are tried only if that one does not fit as expected, or
-    if its rate is nearly, but not quite, that of the frames.
+    if its rate is nearly, but not exactly, that of the frames.
     """
     given, kept, found = clocks[0], None, []
     if given.is_videos:
@@ -313,7 +323,7 @@ def _best_clock(search: _Search, clocks: tuple[PathClock, ...]) -> _Found | None
         found.append(kept)
         if near is not None:
             shift = abs(near.times[0] - given.times[0])
-            if shift > max(_SIGNIFICANT * near.sigma, search.period / 4):
+            if shift > max(_SIGNIFICANCE_SIGMAS * near.sigma, search.period / 4):
                 found.append(near)
     else:
         found.append(_found_in(search, given, search.offsets(given.times)))
@@ -321,7 +331,7 @@ def _best_clock(search: _Search, clocks: tuple[PathClock, ...]) -> _Found | None
     rate = abs(usual_step(given.times) / search.period - 1)
     if (
         best is None
-        or _WHOLE_RATE < rate < _NEAR_RATE
+        or _MAX_WHOLE_RATE_ERROR < rate < _MAX_ASSUMED_RATE_ERROR
         or not _fits_as_expected(search, best)
     ):
         others = clocks if given.is_videos else clocks[1:]
@@ -331,14 +341,14 @@ def _best_clock(search: _Search, clocks: tuple[PathClock, ...]) -> _Found | None
     if best is not None and not (best.is_given and _fits_as_expected(search, best)):
         best = _best_of(search, [best, _with_lost_frames(search, best)])
     if kept is not None and best is not None and not best.is_given:
-        # A path that says its time is believed, unless another time fits outright.
+        # The given times of a path are kept, unless others convince by themselves.
         fit = search.test.fit(*at_times(best.times, search.poses, search.timestamps))
         return best if fit.convinces else kept
     return best
 
 
 def _best_of(search: _Search, found: list[_Found | None]) -> _Found | None:
-    """The first that none of the later ones is significantly better than."""
+    """Returns the first clock that no later one fits significantly better than."""
     best, cost = None, np.zeros((0, 2))
     for one in found:
         if one is None:
@@ -352,38 +362,37 @@ def _best_of(search: _Search, found: list[_Found | None]) -> _Found | None:
 def _found_in(
     search: _Search, clock: PathClock, offsets: Float[np.ndarray, " d"]
 ) -> _Found | None:
-    """The best of the offsets (s) of a clock, refined."""
+    """Returns the best of the offsets (s) of a clock, refined; `None` without one."""
     profile = search.profile(clock.times, offsets)
     count = profile[..., 1].sum(1)
-    enough = count >= max(MIN_TESTED, 0.3 * count.max())
+    enough = count >= max(MIN_TESTED_OBSERVATIONS, 0.3 * count.max())
     if not enough.any():
         return None
     mean = np.where(enough, profile[..., 0].sum(1) / np.maximum(count, 1), np.inf)
     offset, sigma = search.refined(clock.times, float(offsets[int(np.argmin(mean))]))
     rate = usual_step(clock.times) / search.period
-    if abs(rate / max(round(rate), 1) - 1) < _WHOLE_RATE:
-        # Made from the frames of this video, so that poses are of whole frames.
+    if abs(rate / max(round(rate), 1) - 1) < _MAX_WHOLE_RATE_ERROR:
+        # The path was made from the frames of this video: poses are at whole frames.
         first = (clock.times[0] + offset - search.timestamps[0]) / search.period
         moved = (round(first) - first) * search.period
-        if abs(moved) < max(_SIGNIFICANT * sigma, 0.05 * search.period):
+        if abs(moved) < max(_SIGNIFICANCE_SIGMAS * sigma, 0.05 * search.period):
             offset += moved
     return _Found(clock, clock.times + offset, sigma)
 
 
 def _fits_as_expected(search: _Search, found: _Found) -> bool:
-    """Whether as many points fit as under a right path."""
+    """Returns True if as many points fit as with a correct path."""
     fit = search.test.fit(*at_times(found.times, search.poses, search.timestamps))
-    return fit.is_tested and fit.share >= _AS_EXPECTED * fit.expected
+    return fit.is_tested and fit.share >= _MIN_EXPECTED_SHARE * fit.expected
 
 
 def _with_lost_frames(search: _Search, found: _Found) -> _Found | None:
-    """The offset with steps where poses of frames are missing that are not numbered.
+    """Returns the offset with a step at each run of frames that have no pose and were
+    not numbered; `None` if there is no such step.
 
-    Each block of time prefers an offset, told by pieces of tracks that lie within it,
-    as no offset explains a track across a step; the cheapest series of offsets that
-    only grow is found by dynamic programming, and then the frame of each step.
-
-    Returns: `None` if there is no such step.
+    Each block of time prefers an offset, which is tested by pieces of tracks within it,
+    as no offset explains a track across a step. The increasing series of offsets of
+    least cost is found by dynamic programming, and then the frame of each step.
     """
     period, start = search.period, search.timestamps[0]
     # A path with lost frames was made from this video: it begins and ends within it.
@@ -400,14 +409,14 @@ def _with_lost_frames(search: _Search, found: _Found) -> _Found | None:
     num = profile[..., 1].max(0)
     mean = profile[..., 0] / np.maximum(profile[..., 1], 1)
     unseen = profile[..., 1] < 0.5 * num
-    # Where the path has no pose, no offset is better than another.
+    # Blocks in which an offset has no poses get the median cost: no preference.
     seen = np.where(unseen, np.nan, mean)
     usual = np.array([np.nanmedian(c) if np.isfinite(c).any() else 0.0 for c in seen.T])
     cost = np.where(unseen, usual, mean) * num
     penalty = _LOST_PENALTY * np.median(cost, axis=0).sum() + 1e-9
     total, back = cost[:, 0], []
     for b in range(1, cost.shape[1]):
-        # From the best of the smaller offsets, with a penalty, or the same.
+        # Either a step from the best smaller offset, with a penalty, or none.
         best = np.minimum.accumulate(total)
         at = np.maximum.accumulate(np.where(total <= best, np.arange(len(total)), 0))
         jumps = best + penalty < total
@@ -421,7 +430,7 @@ def _with_lost_frames(search: _Search, found: _Found) -> _Found | None:
     if not len(ends):
         return None
     times = times + offset[0] * period
-    # Pose before which each step lies, and its frames: by whole tracks.
+    # The pose at which each step lies, and its number of frames: by whole tracks.
     counts = offset[ends + 1] - offset[ends]
     before = np.cumsum(counts) - counts
     at = (ends + 1) * _PIECE_FRAMES - offset[0] - before
@@ -431,7 +440,7 @@ def _with_lost_frames(search: _Search, found: _Found) -> _Found | None:
         after = np.arange(len(times))[:, None] >= at
         return times + period * (after * counts).sum(1)
 
-    # First where, then also by how many; the last round by all views near the step.
+    # First the pose, then also the number of frames; last by all views near the step.
     rounds = ((2 * _PIECE_FRAMES, 0), (3, 2), (3, 1))
     for turn, (reach, change) in enumerate(rounds):
         for k in range(len(at)):
@@ -459,7 +468,7 @@ def _with_lost_frames(search: _Search, found: _Found) -> _Found | None:
 def _with_best_focal(
     search: _Search, path: CameraPath, tracks: Tracks, guess: Intrinsics
 ) -> tuple[_Search, Intrinsics, list[str]]:
-    """The guessed focal length under which the path fits best at its best offset."""
+    """Corrects a guessed focal length by the one with which the path fits best."""
     assert path.poses is not None
     clock = path.clocks[0]
     tries: list[tuple[float, float, _Search, Intrinsics]] = []
@@ -473,7 +482,7 @@ def _with_best_focal(
         profile = other.profile(clock.times, offsets)
         count = profile[..., 1].sum(1)
         mean = profile[..., 0].sum(1) / np.maximum(count, 1)
-        mean[count < max(MIN_TESTED, 0.3 * count.max())] = np.inf
+        mean[count < max(MIN_TESTED_OBSERVATIONS, 0.3 * count.max())] = np.inf
         tries.append((float(mean.min()), abs(factor - 1), other, camera))
     best = min(tries, key=lambda one: one[:2])
     same = next(one for one in tries if one[1] == 0.0)
@@ -491,11 +500,11 @@ def _minimum(
     profile: Float[np.ndarray, "d b 2"],
     phase: Int[np.ndarray, " d"],
 ) -> tuple[float, float]:
-    """The offset of least cost by a parabola, and its sigma by the jackknife over
-    blocks.
+    """Returns the offset of least cost by a parabola, and its sigma by
+    the jackknife over blocks.
 
     Args:
-        phase: number of the phase of each offset, which has a constant of its own.
+        phase: index of the phase of each offset; each phase has its own constant.
     """
     parts = np.flatnonzero(profile[..., 1].min(0) > 0)
     total = profile.sum(1)
@@ -508,7 +517,7 @@ def _minimum(
 
     def fitted(cost: Float[np.ndarray, "d 2"]) -> float:
         mean = cost[:, 0] / np.maximum(cost[:, 1], 1)
-        # Near the minimum, where it is a parabola.
+        # Offsets near the minimum have most weight: the cost is a parabola there.
         weight = 1 / (1 + ((mean - mean.min()) / (np.ptp(mean) / 4 + 1e-12)) ** 2)
         root = np.sqrt(weight)[:, None]
         found = np.linalg.lstsq(A * root, mean * root[:, 0], rcond=None)[0]

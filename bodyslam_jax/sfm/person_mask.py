@@ -1,4 +1,4 @@
-"""Where people are in an image: given masks, or capsules around their keypoints."""
+"""Masks of the people in an image: given ones, or capsules around keypoints."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from bodyslam_jax.io.masks import mask_names, read_named, resized_to
 from bodyslam_jax.types import DetectedPeople, Keypoints, MaskUse, Sequence
 
-# BODY_25 limbs and their half widths, of the person's height.
+# BODY_25 limbs with their half widths, relative to the person's height.
 _LIMBS = (
     (1, 8, 0.11),  # trunk
     (1, 2, 0.06),
@@ -36,30 +36,31 @@ _LIMBS = (
     (14, 19, 0.035),
     (14, 21, 0.035),
 )
-# Parts that a detector may not give: (from, to, how far beyond, half width).
-_BEYOND = (
+# Parts beyond the keypoints: (from, to, share of the limb beyond `to`, half width).
+_EXTENDED_PARTS = (
     (8, 1, 0.35, 0.10),  # head
     (3, 4, 0.5, 0.05),  # hands
     (6, 7, 0.5, 0.05),
     (10, 11, 0.25, 0.05),  # feet
     (13, 14, 0.25, 0.05),
 )
-_LEAST_CONFIDENCE = 0.05
+_MIN_CONFIDENCE = 0.05
 SILHOUETTE_STEP = 4
-"""Pixels between two of a silhouette (`DetectedPeople.silhouettes`)."""
-_MAX_GAP = 1.0
-"""Time over which a person who is not detected is still masked, s."""
+"""Image pixels per pixel of a silhouette (`DetectedPeople.silhouettes`)."""
+_MAX_GAP_S = 1.0
+"""Longest time without a detection over which a person is still masked, s."""
 
 
 def person_masks(
     sequence: Sequence, margin: float
 ) -> Iterator[UInt8[np.ndarray, "y x"] | None]:
-    """Masks of all people, frame after frame: 255 is person; None if nothing is known.
+    """Yields the masks of all people, frame after frame: 255 is person; `None` without
+    masks, keypoints and detections.
 
     Args:
-        margin: width added on all sides, of the person's height in the image.
+        margin: width added on all sides, relative to the person's height in the image.
 
-    **Raises:** `ValueError` if a given mask has not the size of the image.
+    **Raises:** `ValueError` if the size of a given mask is not that of the image.
     """
     size = (sequence.intrinsics.height, sequence.intrinsics.width)
     if sequence.masks is not None:
@@ -76,7 +77,7 @@ def person_masks(
     elif sequence.keypoints is not None or sequence.detected is not None:
         people = np.zeros((0, sequence.num_frames, 25, 3))
         if sequence.keypoints is not None:
-            people = _fill_gaps(sequence.keypoints, round(_MAX_GAP * sequence.fps))
+            people = _fill_gaps(sequence.keypoints, round(_MAX_GAP_S * sequence.fps))
         for k in range(sequence.num_frames):
             mask = np.zeros(size, dtype=np.uint8)
             for person in people:
@@ -90,7 +91,7 @@ def person_masks(
 
 
 def _given_masks(sequence: Sequence, folder: Path) -> Iterator[Bool[np.ndarray, "y x"]]:
-    """The masks of the sequence's frames as they are given: true is person."""
+    """Yields the given masks of the sequence's frames: true is person."""
     use = sequence.mask_use
     size = (sequence.intrinsics.width, sequence.intrinsics.height)
     if use is None:
@@ -109,11 +110,12 @@ def _given_masks(sequence: Sequence, folder: Path) -> Iterator[Bool[np.ndarray, 
 
 
 def _painted(sequence: Sequence) -> Float[np.ndarray, "h t 25 3"]:
-    """People whose keypoints are masked beside given masks; none if these are right."""
+    """Returns people whose keypoints are masked besides given masks; none if these are
+    complete."""
     use = sequence.mask_use
     if use is None or not use.with_keypoints or sequence.keypoints is None:
         return np.zeros((0, sequence.num_frames, 25, 3))
-    return _fill_gaps(sequence.keypoints, round(_MAX_GAP * sequence.fps))
+    return _fill_gaps(sequence.keypoints, round(_MAX_GAP_S * sequence.fps))
 
 
 def _draw_detected(
@@ -135,7 +137,7 @@ def draw_person(
     mask: UInt8[np.ndarray, "y x"], points: Float[np.ndarray, "25 3"], margin: float
 ) -> None:
     """Paints one person, given as (u px, v px, confidence), into `mask` with 255."""
-    detected = points[:, 2] > _LEAST_CONFIDENCE
+    detected = points[:, 2] > _MIN_CONFIDENCE
     if detected.sum() < 2:
         return
     height = _height(points, detected)
@@ -150,14 +152,15 @@ def draw_person(
     for i, j, width in _LIMBS:
         if detected[i] and detected[j]:
             paint(points[i], points[j], width)
-    for i, j, beyond, width in _BEYOND:
+    for i, j, beyond, width in _EXTENDED_PARTS:
         if detected[i] and detected[j]:
             end = points[j] + beyond * (points[j] - points[i])
             paint(points[j], end, width)
 
 
 def _height(points: np.ndarray, detected: np.ndarray) -> float:
-    """Size of a person in the image (px), also if bent or partly hidden."""
+    """Estimates the height of a person in the image (px), also if bent or partly
+    hidden."""
     box = np.ptp(points[detected, :2], axis=0)
     size = float(np.hypot(*box))
     if detected[1] and detected[8]:  # the trunk is 0.3 of the height
@@ -171,19 +174,20 @@ def _pixel(point: np.ndarray) -> tuple[int, int]:
 
 
 def _fill_gaps(keypoints: Keypoints, max_gap: int) -> Float[np.ndarray, "h t 25 3"]:
-    """Keypoints with short gaps bridged, so that a missed detection is masked too."""
+    """Returns keypoints with short gaps interpolated, so that people are masked in
+    frames without a detection."""
     points = np.concatenate([keypoints.uv, keypoints.confidence[..., None]], axis=-1)
     num_frames = points.shape[1]
     for person in points:
         for j in range(25):
-            at = np.flatnonzero(person[:, j, 2] > _LEAST_CONFIDENCE)
+            at = np.flatnonzero(person[:, j, 2] > _MIN_CONFIDENCE)
             if not len(at):
                 continue
             before = at[np.searchsorted(at, np.arange(num_frames), "right") - 1]
             after = at[
                 np.minimum(np.searchsorted(at, np.arange(num_frames)), len(at) - 1)
             ]
-            # Who has not been seen yet has not come yet.
+            # Before the first detection a person is absent.
             for k in np.setdiff1d(np.arange(at[0], num_frames), at):
                 if abs(k - before[k]) <= max_gap and abs(k - after[k]) <= max_gap:
                     part = (k - before[k]) / max(after[k] - before[k], 1)

@@ -9,12 +9,12 @@ from bodyslam_jax.sfm.multiview import refine_pose
 
 Pose = tuple[np.ndarray, np.ndarray]
 """R_CW (3, 3) and the centre (3,) of a camera."""
-_LEAST = 10
-"""Points that must agree."""
-_BY_CHANCE = 4.0
-"""Times the points that would agree by chance."""
-_ANNEALED = (6.0, 3.0, 1.5, 1.0)
-"""Scales of the loss in turn, in thresholds."""
+_MIN_AGREEING_POINTS = 10
+"""Least number of points that agree on a pose."""
+_MIN_CHANCE_RATIO = 4.0
+"""Least ratio of the points that agree to those that would by chance."""
+_ANNEALED_SCALES = (6.0, 3.0, 1.5, 1.0)
+"""Successive scales of the loss, in thresholds."""
 
 
 def near(
@@ -23,8 +23,8 @@ def near(
     pose: Pose,
     radius: float,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Rows of `xy` and of `points` that lie within `radius` of each other in an image
-    of depth 1."""
+    """Returns pairs of rows of `xy` and of projected `points` within `radius` of each
+    other in the image at depth 1."""
     R, centre = pose
     p_C = (points - centre) @ R.T
     front = np.flatnonzero(p_C[:, 2] > 1e-6)
@@ -44,23 +44,23 @@ def relocate(
     threshold: float,
     share: float,
 ) -> tuple[Pose | None, float]:
-    """The camera pose from `points`, `None` if too few agree; and the drift from
-    `pose`: the median shift of the points that agree, at depth 1.
+    """Returns the camera pose from `points`, `None` if too few agree, and the drift
+    from `pose`: the median shift of the points that agree, at depth 1.
 
     Most of the pairs may be wrong matches; only correct ones agree on a pose.
 
     Args:
-        which: which image point a row is of; several rows may share one.
-        share: part of wrong pairs that agree by chance.
+        which: index of the image point of each row; several rows may share one.
+        share: share of wrong pairs that agree by chance.
     """
-    least = max(_LEAST, _BY_CHANCE * share * len(xy))
+    least = max(_MIN_AGREEING_POINTS, _MIN_CHANCE_RATIO * share * len(xy))
     agree = lambda projected: len(
         np.unique(which[np.linalg.norm(projected - xy, axis=-1) < threshold])
     )
     before = _project(points, pose)
     R, centre = pose
-    # Where the map has hardly drifted, no wide loss need be tried.
-    for scale in _ANNEALED[2 if agree(before) > least else 0 :]:
+    # Where the map has hardly drifted, the wide losses are skipped.
+    for scale in _ANNEALED_SCALES[2 if agree(before) > least else 0 :]:
         found = refine_pose(R, centre, points, xy, scale * threshold)
         if found is None:
             return None, 0.0
@@ -79,8 +79,8 @@ def _project(points: np.ndarray, pose: Pose) -> np.ndarray:
 
 
 def with_moved(scene: Scene, frame: int, pose: Pose) -> Scene:
-    """All cameras, followed by copies that are moved by the rigid transform which takes
-    camera `frame` to `pose`."""
+    """Returns all cameras, followed by copies that are moved by the rigid transform
+    from camera `frame` to `pose`."""
     R, centre = pose
     turn = R.T @ scene.R_CW[frame]
     R_CW = scene.R_CW @ turn.T

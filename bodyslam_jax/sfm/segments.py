@@ -1,4 +1,4 @@
-"""Straight line segments in some images of a video, people left out."""
+"""Straight line segments in some images of a video, outside of people."""
 
 import dataclasses
 
@@ -11,31 +11,33 @@ from bodyslam_jax.sfm.person_mask import person_masks
 from bodyslam_jax.types import Sequence
 
 _PERSON_MARGIN = 0.05
-"""Width added to people's masks, of their height in the image."""
-_SHORTEST = 0.05
-"""Length of the shortest segment, as a share of the image's longer side."""
-_SAMPLES = 7
-"""Points of a segment at which the mask of people is looked up."""
+"""Width added to people's masks, relative to their height in the image."""
+_MIN_LENGTH_SHARE = 0.05
+"""Least length of a segment, as a share of the image's longer side."""
+_NUM_MASK_SAMPLES = 7
+"""Number of points of a segment at which the mask of people is looked up."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Segments:
-    """Straight segments in images; `s` in all."""
+    """`s` straight segments in images."""
 
     frame: Int[np.ndarray, " s"]
     """Index of the frame."""
     ends: Float[np.ndarray, "s 2 2"]
-    """Pixels of both ends."""
+    """Image positions of both ends, px."""
 
 
 def find_segments(sequence: Sequence, wanted: Int[np.ndarray, " n"]) -> Segments:
-    """Segments in the frames `wanted` that are on no person, by OpenCV's detector LSD
+    """Detects segments in the frames `wanted` that are on no person, by OpenCV's LSD
     (Grompone von Gioi et al., 2010).
 
     **Raises:** `ValueError` if the sequence has no images or one cannot be read.
     """
     detector = cv2.createLineSegmentDetector()
-    shortest = _SHORTEST * max(sequence.intrinsics.width, sequence.intrinsics.height)
+    shortest = _MIN_LENGTH_SHARE * max(
+        sequence.intrinsics.width, sequence.intrinsics.height
+    )
     chosen, last = set(wanted.tolist()), int(max(wanted, default=-1))
     frame, ends = [np.zeros(0, int)], [np.zeros((0, 2, 2))]
     images = read_frames(sequence, gray=True)
@@ -51,7 +53,7 @@ def find_segments(sequence: Sequence, wanted: Int[np.ndarray, " n"]) -> Segments
         found = lines.reshape(-1, 2, 2).astype(float)
         found = found[np.linalg.norm(found[:, 1] - found[:, 0], axis=1) > shortest]
         if mask is not None:
-            share = np.linspace(0, 1, _SAMPLES)[:, None]
+            share = np.linspace(0, 1, _NUM_MASK_SAMPLES)[:, None]
             at = found[:, None, 0] + share * (found[:, None, 1] - found[:, None, 0])
             size = np.array(mask.shape[::-1]) - 1
             column, row = np.moveaxis(np.clip(at.round().astype(int), 0, size), -1, 0)

@@ -1,4 +1,4 @@
-"""Tracks and intrinsics -> a camera pose for every frame and a map, up to scale."""
+"""Structure from motion: a camera pose for every frame and a map, up to scale."""
 
 import dataclasses
 from typing import Literal
@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.config import Structure
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import Scene, Views, errors
 from bodyslam_jax.sfm.camera_motion import (
@@ -18,34 +19,37 @@ from bodyslam_jax.sfm.camera_motion import (
     rotations_only,
     stillness,
 )
-from bodyslam_jax.sfm.given_path import MIN_TESTED, PathTest, what_would_fit
-from bodyslam_jax.sfm.incremental import MIN_SHARED, Builder, build_map
-from bodyslam_jax.sfm.missing_poses import fill_missing_poses
+from bodyslam_jax.sfm.given_path import (
+    MIN_TESTED_OBSERVATIONS,
+    PathTest,
+    what_would_fit,
+)
+from bodyslam_jax.sfm.incremental import MIN_SHARED_POINTS, Builder, build_map
 from bodyslam_jax.sfm.partial_map import PartialMap, Refine
 from bodyslam_jax.sfm.track_splitting import information_from_other_tracks
 from bodyslam_jax.types import CameraPath, Intrinsics, Tracks
 
 Kind = Literal["moving", "rotation", "static", "failed"]
 
-_KEYFRAME_MOTION = 0.03
-"""Motion of points between keyframes, of the image's longer side."""
-_STATIC_MOTION = 0.6
-"""Motion of points below which the camera stands still, px: assumes that medians over
+_KEYFRAME_MOTION_SHARE = 0.03
+"""Motion of points between keyframes, as a share of the image's longer side."""
+_MAX_STATIC_MOTION_PX = 0.6
+"""Motion of points below which the camera is static, px: assumes that medians over
 10 frames of tracks with 0.5 px noise at 640x480 drift by less; not scaled with the
 image."""
-TURNING_ERROR = 1.0
+MAX_ROTATION_ERROR_PX = 1.0
 """Residual of a pure rotation below which there is no usable parallax, px: 2 σ of an
 assumed tracking noise of 0.5 px at 640x480; not scaled with the image."""
-_LEAST_BASELINE = 0.08
-"""Extent of the camera path below which the camera only rotates, of the median distance
-of landmarks: assumes that a wrong focal length lets a rotating camera seem to move by
-less than this."""
-_MAPPED = 0.3
-"""Share of observations of triangulated points below which the images may show no
-parallax along a given path."""
+_MIN_BASELINE = 0.08
+"""Extent of the camera path, relative to the median distance of landmarks, below which
+the camera only rotates: assumes that a wrong focal length makes a rotating camera
+appear to move by less than this."""
+_MIN_MAPPED_SHARE = 0.3
+"""Share of observations that triangulated points explain, below which the images may
+show no parallax along a given path."""
 
-_CERTAIN_PARALLAX = 6.0
-"""Residual of a pure rotation, in `TURNING_ERROR`, beyond which the camera
+_MIN_CERTAIN_PARALLAX = 6.0
+"""Residual of a pure rotation, in `MAX_ROTATION_ERROR_PX`, beyond which the camera
 certainly translates: 6 px, assuming that tracking noise (0.5 px at
 640x480) and a wrong focal length together stay below it."""
 
@@ -55,7 +59,7 @@ class Reconstruction:
     """Cameras and map of `t` frames and `l` landmarks, up to scale."""
 
     kind: Kind
-    """`moving`: all below holds. `rotation`: the camera only turns, its centre is 0 and
+    """`moving`: the camera translates. `rotation`: it only turns, its centre is 0 and
     the landmarks are directions (distance 1). `static`: it does not even turn.
     `failed`: no estimate; poses are the identity."""
     T_WC: Float[np.ndarray, "t 4 4"]
@@ -65,18 +69,19 @@ class Reconstruction:
     """Frames whose pose was estimated; the other poses are interpolated or held."""
     landmarks: Float[np.ndarray, "l 3"]
     tracks: Tracks
-    """The observations that fit, of these landmarks."""
+    """Inlier observations of these landmarks."""
     inlier: Bool[np.ndarray, " m"]
-    """Which of the `m` observations given they are."""
+    """Which of the `m` given observations are inliers."""
     landmark_ids: Int[np.ndarray, " l"]
-    """Index of each among the given landmarks; a long track is several landmarks."""
+    """Index of each landmark among the given ones; a long track
+    is several landmarks."""
     prior_information: Float[np.ndarray, "l 3 3"]
     """Information of other tracks of the same point on each landmark's position, px²
     per squared unit of the map: to be divided by the variance of a pixel."""
     error: float
     """Median reprojection error of the inliers, px."""
     unit: float = 1.0
-    """The map's unit in that of a camera path that was known."""
+    """The map's unit, in units of a given camera path."""
     warnings: tuple[str, ...] = ()
 
 
@@ -90,18 +95,18 @@ def reconstruct(
     path: CameraPath | None = None,
     static: bool = False,
 ) -> Reconstruction:
-    """Structure from motion, with a classification of the camera motion.
+    """Reconstructs cameras and points, and classifies the camera motion.
 
     After a cut only the longest shot is reconstructed; the other frames hold the
     nearest pose and are not registered. Every frame gets a pose.
 
     Args:
-        refine: adjusts cameras and points in place, in the stead of the built-in bundle
-            adjustment while the reconstruction grows.
-        path: camera poses that are known: points are triangulated from them.
+        refine: adjusts cameras and points in place, instead of the built-in bundle
+            adjustment, while the map grows.
+        path: given camera poses, from which points are triangulated.
         static: whether the camera is known not to move.
 
-    **Raises:** `InputError` if the points do not fit a path that is known.
+    **Raises:** `InputError` if the points do not fit a given path.
     """
     K, distortion = as_opencv(intrinsics.params)
     focal = float(np.sqrt(K[0, 0] * K[1, 1]))
@@ -121,7 +126,7 @@ def reconstruct(
         return _along(problem, path, config, refine)
     if static:
         return _on_a_tripod(problem)
-    first, last, warnings = _longest_shot(views, num_frames, MIN_SHARED)
+    first, last, warnings = _longest_shot(views, num_frames, MIN_SHARED_POINTS)
     within = (views.frame >= first) & (views.frame <= last)
     shot = views[np.flatnonzero(within)]
     if len(np.unique(shot.frame)) < 2:
@@ -131,13 +136,13 @@ def reconstruct(
             text = "one frame shows no motion."
         return _nothing(problem, "failed", (*warnings, text))
     still = stillness(shot) * focal
-    if still < _STATIC_MOTION:
+    if still < _MAX_STATIC_MOTION_PX:
         text = f"the camera stands still (points wander {still:.2f} px)."
         return _fixed(problem, within, "static", None, (*warnings, text))
-    motion = _KEYFRAME_MOTION * max(intrinsics.width, intrinsics.height) / focal
-    keyframes = choose_keyframes(shot, first, last, motion, MIN_SHARED)
+    motion = _KEYFRAME_MOTION_SHARE * max(intrinsics.width, intrinsics.height) / focal
+    keyframes = choose_keyframes(shot, first, last, motion, MIN_SHARED_POINTS)
     pairs = rotation_error(shot, keyframes, 1 / focal)
-    away = _turning_error(pairs) * focal / TURNING_ERROR
+    away = _turning_error(pairs) * focal / MAX_ROTATION_ERROR_PX
     built = None
     if away > 1:
         size = (num_frames, num_landmarks)
@@ -150,10 +155,10 @@ def reconstruct(
         inlier[within] = grown.inlier
         found = _moving(problem, grown, inlier, (first, last), warnings)
         extent = np.linalg.norm(np.ptp(found.T_WC[found.registered, :3, 3], axis=0))
-        # A wrong focal length makes even a rotating camera seem to move a little.
-        if away > _CERTAIN_PARALLAX or extent > _LEAST_BASELINE:
+        # A wrong focal length makes even a rotating camera appear to move a little.
+        if away > _MIN_CERTAIN_PARALLAX or extent > _MIN_BASELINE:
             return found
-    elif away > _CERTAIN_PARALLAX:
+    elif away > _MIN_CERTAIN_PARALLAX:
         text = "no pair of frames has enough parallax to start a map."
         return _nothing(problem, "failed", (*warnings, text))
     text = (
@@ -165,6 +170,8 @@ def reconstruct(
 
 @dataclasses.dataclass(frozen=True)
 class _Problem:
+    """The input of a reconstruction."""
+
     tracks: Tracks
     views: Views
     intrinsics: Intrinsics
@@ -174,7 +181,8 @@ class _Problem:
 
 
 def _on_a_tripod(problem: _Problem) -> Reconstruction:
-    """A camera on a tripod by the user's statement: the identity in every frame."""
+    """Returns the reconstruction of a camera that the user states to be static: the
+    identity in every frame."""
     if len(np.unique(problem.views.frame)) > 1:
         every = np.ones(len(problem.views.frame), bool)
         found = _fixed(problem, every, "static", None, ())
@@ -190,16 +198,18 @@ def _on_a_tripod(problem: _Problem) -> Reconstruction:
 def _along(
     problem: _Problem, path: CameraPath, config: Structure, refine: Refine | None
 ) -> Reconstruction:
-    """The map along a given camera path, and poses of frames that the path lacks.
+    """Returns the map along a given camera path, and poses of frames that it lacks.
 
-    **Raises:** `InputError` if most points fit no place in the scene.
+    **Raises:** `InputError` if too few points fit the path.
     """
     size = (problem.num_frames, problem.num_landmarks)
     builder = Builder(problem.views, *size, problem.focal, config, refine)
     grown = builder.begin(path)
     builder.complete(grown, np.arange(problem.num_frames))
     num_seen = len(problem.views.frame)
-    if not num_seen or (not grown.has_point.any() and num_seen < MIN_TESTED):
+    if not num_seen or (
+        not grown.has_point.any() and num_seen < MIN_TESTED_OBSERVATIONS
+    ):
         text = (
             f"camera path: {num_seen} observations of background points, of which no "
             "map can be made: the given path is used as it is and was not compared "
@@ -211,7 +221,11 @@ def _along(
     test = PathTest(problem.tracks, problem.intrinsics, problem.num_frames)
     fit = test.fit(path.T_WC, path.known)
     mapped, tested = builder.share_explained(grown, np.flatnonzero(path.known))
-    if tested >= MIN_TESTED and mapped < _MAPPED and _only_turns(problem):
+    if (
+        tested >= MIN_TESTED_OBSERVATIONS
+        and mapped < _MIN_MAPPED_SHARE
+        and _only_turns(problem)
+    ):
         text = (
             "the images show no parallax along the given path: the camera only turns."
         )
@@ -243,18 +257,20 @@ def _along(
 
 
 def _only_turns(problem: _Problem) -> bool:
-    """Whether a rotation explains the images of all keyframes."""
+    """Returns True if a rotation explains the images of all keyframes."""
     shot = problem.views
-    motion = _KEYFRAME_MOTION * max(problem.intrinsics.width, problem.intrinsics.height)
+    motion = _KEYFRAME_MOTION_SHARE * max(
+        problem.intrinsics.width, problem.intrinsics.height
+    )
     keyframes = choose_keyframes(
         shot,
         int(shot.frame.min()),
         int(shot.frame.max()),
         motion / problem.focal,
-        MIN_SHARED,
+        MIN_SHARED_POINTS,
     )
     pairs = rotation_error(shot, keyframes, 1 / problem.focal)
-    return _turning_error(pairs) * problem.focal < TURNING_ERROR
+    return _turning_error(pairs) * problem.focal < MAX_ROTATION_ERROR_PX
 
 
 def _longest_shot(
@@ -285,7 +301,7 @@ def _longest_shot(
 
 
 def _turning_error(pairs: np.ndarray) -> float:
-    """Residual (rad) of a pure rotation for the pairs that it fits worst."""
+    """Returns the residual (rad) of a pure rotation for the worst pairs."""
     if not len(pairs):
         return np.inf
     telling = pairs[:, 2] * np.minimum(pairs[:, 3], 80)
@@ -299,7 +315,7 @@ def _moving(
     shot: tuple[int, int],
     warnings: tuple[str, ...],
 ) -> Reconstruction:
-    """Puts the world into the first camera and the unit at the median distance."""
+    """Moves the world to the first camera, and the unit to the median distance."""
     lost = np.arange(shot[0], shot[1] + 1)
     lost = lost[~grown.registered[lost]]
     if len(lost):
@@ -342,7 +358,8 @@ def _fixed(
     scale: float | None,
     warnings: tuple[str, ...],
 ) -> Reconstruction:
-    """A camera whose centre does not move: rotations if `scale` is given, else none."""
+    """Returns the reconstruction of a camera whose centre does not move: with rotations
+    if `scale` is given, else without."""
     shot = problem.views[np.flatnonzero(within)]
     size = (problem.num_frames, problem.num_landmarks)
     rotations = rotations_only(shot, *size, scale or 1.0, turns=scale is not None)
@@ -385,7 +402,8 @@ def _pack(
     prior_information: np.ndarray | None = None,
     unit: float = 1.0,
 ) -> Reconstruction:
-    """`which`: the track that each landmark is of; the landmark of each inlier."""
+    """Assembles a reconstruction; `which` has the track of each landmark, and the
+    landmark of each inlier."""
     ids, landmark = which
     tracks = Tracks(problem.tracks.frame[inlier], landmark, problem.tracks.uv[inlier])
     error = 0.0
@@ -409,3 +427,23 @@ def _pack(
         unit=unit,
         warnings=warnings,
     )
+
+
+def fill_missing_poses(
+    T_WC: Float[np.ndarray, "t 4 4"], valid: Bool[np.ndarray, " t"]
+) -> Float[np.ndarray, "t 4 4"]:
+    """Interpolates poses where not `valid`; before the first and after the last valid
+    one they are constant."""
+    at = np.flatnonzero(valid)
+    if not len(at) or valid.all():
+        return T_WC
+    filled = T_WC.copy()
+    time = np.clip(np.arange(len(T_WC)), at[0], at[-1])
+    if len(at) == 1:
+        filled[:] = T_WC[at[0]]
+        return filled
+    filled[:, :3, :3] = so3.interpolate_path(at, T_WC[at, :3, :3], time)
+    for axis in range(3):
+        filled[:, axis, 3] = np.interp(time, at, T_WC[at, axis, 3])
+    filled[at] = T_WC[at]
+    return filled

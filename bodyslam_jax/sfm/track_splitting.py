@@ -1,8 +1,8 @@
 """Long tracks are split into several landmarks that share their information.
 
 The cost of a solver step grows with the square of the frames that a landmark spans. So
-a long track becomes several landmarks, and each gets a prior with the information that
-the other pieces have on the same point.
+a long track becomes several landmarks, each with a prior from the information of the
+other pieces on the same point.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ def split_tracks(
 ) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " m"]]:
     """Cuts tracks that span more than `longest` frames into equal pieces.
 
-    Returns: the track that each piece is of, and the piece of each observation.
+    Returns the track of each piece, and the piece of each observation.
     """
     if not len(frame):
         return np.zeros(0, int), np.zeros(0, int)
@@ -36,16 +36,16 @@ def split_tracks(
 def information_from_other_tracks(
     scene: Scene, views: Views, shown: Int[np.ndarray, " l"]
 ) -> Float[np.ndarray, "l 3 3"]:
-    """Information matrix that the other tracks of the same point (or the other pieces
-    of a long track) provide for each track's landmark.
+    """Returns the information matrix that the other tracks of the same point (or the
+    other pieces of a long track) provide for each track's landmark.
 
     The graph has one landmark per track. Each gets the mean of the others' information,
     so that the sum over the tracks of a point equals the information of all its
     observations. Cameras are held fixed; errors are in units of depth 1.
 
     Args:
-        views: observations that fit, of tracks.
-        shown: the landmark that each track shows.
+        views: inlier observations of tracks.
+        shown: the landmark that each track observes.
     """
     merged = Views(views.frame, shown[views.landmark], views.xy)
     J = jacobian_of_points(scene, merged)
@@ -64,10 +64,10 @@ def information_from_other_pieces(
     piece: Int[np.ndarray, " m"],
     of: Int[np.ndarray, " p"],
 ) -> Float[np.ndarray, "p 3 3"]:
-    """`information_from_other_tracks` for the pieces of tracks of `landmarks`.
+    """Returns `information_from_other_tracks` for pieces of tracks of `landmarks`.
 
     Args:
-        of: the landmark that each piece is of.
+        of: landmark of each piece.
     """
     C_WC = T_WC[:, :3, :3]
     scene = Scene(np.swapaxes(C_WC, 1, 2), T_WC[:, :3, 3], landmarks)

@@ -1,4 +1,4 @@
-"""Images -> tracks of static points, about 200 a frame, spread over the image.
+"""Tracks static points through images, about 200 a frame, spread over the image.
 
 BRISK detects the points; pyramidal Lucas--Kanade (KLT) tracks each from frame to frame,
 forward and backward. BRISK descriptors recover points that were lost for a while.
@@ -22,32 +22,32 @@ from bodyslam_jax.sfm.features import epipolar_inliers, make_brisk, match, sprea
 from bodyslam_jax.sfm.person_mask import person_masks
 from bodyslam_jax.types import Sequence, Tracks
 
-_REFILL_GAP = 3
-"""Frames between two searches for points, unless half of them are gone."""
-_KEYFRAME_STEP = 12
-"""Frames between two that are remembered."""
+_REFILL_GAP_FRAMES = 3
+"""Number of frames between two searches for points, unless half of them are lost."""
+_KEYFRAME_STEP_FRAMES = 12
+"""Number of frames between two keyframes."""
 _NUM_KEYFRAMES = 12
-_FEWEST_MOVING = 15
-_TIMES_STILL = 4.0
-"""Displacement of a point that moves, of that of one that may be still."""
-_ROUND_TRIP = 0.5
+_MIN_MOVING_POINTS = 15
+_MIN_MOVING_RATIO = 4.0
+"""Least ratio of the displacement of a moving point to the limit of still ones."""
+_MAX_ROUND_TRIP_PX = 0.5
 """Largest forward-backward error of KLT, px: assumes that KLT localises a window to
 clearly better than that, in images of any size."""
-_LEAST_CONTRAST = 6
-"""BRISK's threshold in the flattest image, grey levels."""
-_CONTRAST, _OCTAVES = 20, 3
-"""BRISK's threshold at the start, grey levels, and octaves of its pyramid."""
-CELLS = 8
-"""Cells along the longer side of the image, over which points are spread."""
-WINDOW = 21
-"""Side of the window that Lucas--Kanade follows, px (OpenCV's default)."""
-_EPIPOLAR_LIMIT = 1.5
+_MIN_BRISK_THRESHOLD = 6
+"""Least threshold of BRISK, in images without contrast, grey levels."""
+_BRISK_THRESHOLD, _BRISK_OCTAVES = 20, 3
+"""Initial threshold of BRISK, grey levels, and number of octaves of its pyramid."""
+NUM_CELLS = 8
+"""Number of cells along the longer side of the image, over which points are spread."""
+KLT_WINDOW_PX = 21
+"""Side of the window of Lucas--Kanade, px (OpenCV's default)."""
+_MAX_EPIPOLAR_DISTANCE_PX = 1.5
 """Distance from the epipolar line beyond which a point is dropped, px: 3 σ of an
 assumed tracking noise of 0.5 px at 640x480; not scaled with the image."""
-_RIGID_GAP = 10
-"""Frames over which points must fit one rigid motion."""
+_RIGID_GAP_FRAMES = 10
+"""Number of frames over which points must fit one rigid motion."""
 _PERSON_MARGIN = 0.06
-"""Width that is masked around people's keypoints, of the person's height."""
+"""Width that is masked around people's keypoints, relative to their height."""
 
 
 Mask = UInt8[np.ndarray, "y x"]
@@ -61,11 +61,11 @@ def follow(
     look: Callable[[Mask], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Tracks:
-    """Follows points through the images of a sequence, once.
+    """Tracks points through the images of a sequence, in one pass.
 
     Args:
         hidden: a mask (255) for each frame, added to those of the people.
-        look: called with each gray image.
+        look: called with each grey image.
         progress: called with the number of frames done and their total.
 
     **Raises:** `ValueError` if images cannot be read or OpenCV lacks BRISK.
@@ -90,12 +90,12 @@ def follow(
 
 @dataclasses.dataclass
 class _Live:
-    """Points being followed; rows belong together."""
+    """Points that are being tracked, one a row."""
 
     ids: np.ndarray
     uv: np.ndarray
     step: np.ndarray
-    """Last motion, px a frame: the start of the next search."""
+    """Last displacement, px a frame: the start of the next search."""
 
     def keep(self, mask: np.ndarray) -> "_Live":
         return _Live(*(getattr(self, f.name)[mask] for f in dataclasses.fields(self)))
@@ -110,7 +110,7 @@ class _Live:
 
 @dataclasses.dataclass(frozen=True)
 class _Keyframe:
-    """A frame whose points can be found again."""
+    """A frame with the descriptors of its points, by which they can be found again."""
 
     image: np.ndarray
     ids: np.ndarray
@@ -119,24 +119,26 @@ class _Keyframe:
 
 
 class _Tracker:
-    """What is remembered from frame to frame; memory does not grow with images."""
+    """State of the tracker, whose memory does not grow with the number of images."""
 
     def __init__(self, sequence: Sequence, config: Tracking):
         self.config = config
         self.size = (sequence.intrinsics.width, sequence.intrinsics.height)
         self.K, self.distortion = as_opencv(sequence.intrinsics.params)
-        self.brisk = make_brisk(_CONTRAST, _OCTAVES)
+        self.brisk = make_brisk(_BRISK_THRESHOLD, _BRISK_OCTAVES)
         self.live = _Live(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
         self.previous: np.ndarray | None = None
-        self.recent: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=_RIGID_GAP + 1)
+        self.recent: deque[tuple[np.ndarray, np.ndarray]] = deque(
+            maxlen=_RIGID_GAP_FRAMES + 1
+        )
         self.rows: list[tuple[int, np.ndarray, np.ndarray]] = []
         self.next_id = 0
-        self.threshold = _CONTRAST
-        self.last_refill = -_REFILL_GAP
+        self.threshold = _BRISK_THRESHOLD
+        self.last_refill = -_REFILL_GAP_FRAMES
         self.keyframes: deque[_Keyframe] = deque(maxlen=_NUM_KEYFRAMES)
-        self.last_keyframe = -_KEYFRAME_STEP
+        self.last_keyframe = -_KEYFRAME_STEP_FRAMES
         self.scale_of: dict[int, float] = {}
-        """Size of the BRISK keypoint that began a point, px."""
+        """Size of the BRISK keypoint of each point when it was detected, px."""
 
     def advance(self, k: int, gray: np.ndarray, mask: np.ndarray | None) -> None:
         if self.previous is not None and len(self.live.ids):
@@ -145,7 +147,7 @@ class _Tracker:
         if self._is_sparse(k):
             self._refill(gray, mask)
             self.last_refill = k
-            if k - self.last_keyframe >= _KEYFRAME_STEP:
+            if k - self.last_keyframe >= _KEYFRAME_STEP_FRAMES:
                 self._remember(gray)
                 self.last_keyframe = k
         self.previous = gray
@@ -153,7 +155,8 @@ class _Tracker:
         self.rows.append((k, self.live.ids, self.live.uv))
 
     def tracks(self) -> Tracks:
-        """All observations of points seen three times (in all frames, if fewer)."""
+        """Returns all observations of points seen three times (in
+        all frames, if fewer)."""
         frame = np.concatenate([np.full(len(i), k) for k, i, _ in self.rows])
         ids = np.concatenate([i for _, i, _ in self.rows])
         uv = np.concatenate([u for _, _, u in self.rows])
@@ -163,13 +166,13 @@ class _Tracker:
         return Tracks(frame[kept], landmark.astype(np.int64), uv[kept])
 
     def _follow(self, image: np.ndarray, mask: np.ndarray | None) -> None:
-        """KLT from the previous image, with the forward-backward check."""
+        """Tracks points from the previous image by KLT, with forward-backward check."""
         assert self.previous is not None
         live = self.live
         guess = live.uv + live.step
         uv, ok = self._flow(self.previous, image, live.uv, guess)
         back, ok_back = self._flow(image, self.previous, uv, live.uv)
-        ok &= ok_back & (np.linalg.norm(back - live.uv, axis=-1) < _ROUND_TRIP)
+        ok &= ok_back & (np.linalg.norm(back - live.uv, axis=-1) < _MAX_ROUND_TRIP_PX)
         ok &= self._inside(uv, mask)
         live.step, live.uv = uv - live.uv, uv
         self.live = live.keep(ok)
@@ -187,7 +190,7 @@ class _Tracker:
             b,
             uv.astype(np.float32).reshape(-1, 1, 2),
             guess.astype(np.float32).reshape(-1, 1, 2),
-            winSize=(WINDOW, WINDOW),
+            winSize=(KLT_WINDOW_PX, KLT_WINDOW_PX),
             maxLevel=levels,
             criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01),
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
@@ -209,24 +212,24 @@ class _Tracker:
         return ok
 
     def _drop_moving(self) -> None:
-        """Drops what does not fit one rigid motion over the last frames."""
+        """Drops points that do not fit one rigid motion over the last frames."""
         live = self.live
         keep = np.ones(len(live.ids), dtype=bool)
         if not self.recent:
             return
         ids, uv = self.recent[0]
         _, now, then = np.intersect1d(live.ids, ids, return_indices=True)
-        # What stays at its pixel fits every essential matrix without rotation: if it is
-        # burnt into the image, what moves would be dropped in its stead.
+        # Points that stay at their pixel fit every essential matrix without rotation:
+        # if they are burnt into the image, the moving points would be dropped instead.
         moved = np.linalg.norm(live.uv[now] - uv[then], axis=-1)
-        moving = moved > _TIMES_STILL * still_limit(self.size)
-        if _FEWEST_MOVING < moving.sum() < 0.9 * len(moving):
+        moving = moved > _MIN_MOVING_RATIO * still_limit(self.size)
+        if _MIN_MOVING_POINTS < moving.sum() < 0.9 * len(moving):
             still = moved < still_limit(self.size)
             now, then = now[~still], then[~still]
         inlier = epipolar_inliers(
             self._normalise(uv[then]),
             self._normalise(live.uv[now]),
-            _EPIPOLAR_LIMIT / self.K[0, 0],
+            _MAX_EPIPOLAR_DISTANCE_PX / self.K[0, 0],
         )
         keep[now[~inlier]] = False
         self.live = live.keep(keep)
@@ -237,7 +240,9 @@ class _Tracker:
     def _is_sparse(self, k: int) -> bool:
         wanted, found = self.config.num_points, len(self.live.ids)
         since = k - self.last_refill
-        return found < 0.5 * wanted or (found < 0.85 * wanted and since >= _REFILL_GAP)
+        return found < 0.5 * wanted or (
+            found < 0.85 * wanted and since >= _REFILL_GAP_FRAMES
+        )
 
     def _refill(self, gray: np.ndarray, mask: np.ndarray | None) -> None:
         """Finds lost points again, then new ones where the image lacks points."""
@@ -247,8 +252,8 @@ class _Tracker:
             return
         uv = np.array([p.pt for p in found], dtype=np.float64)
         response = np.array([p.response for p in found], dtype=np.float64)
-        cell = -(-max(self.size) // CELLS)
-        # Cells under a person or without texture give their share to the others.
+        cell = -(-max(self.size) // NUM_CELLS)
+        # The quota of cells under a person or without texture goes to the others.
         occupied = np.unique(uv.astype(np.int64) // cell, axis=0)
         quota = -(-wanted // max(len(occupied), 1))
         room = {"size": self.size, "cell": cell}
@@ -266,7 +271,7 @@ class _Tracker:
         self.live = self.live.add(ids, uv[chosen])
 
     def _detect(self, gray: np.ndarray, mask: np.ndarray | None) -> list[cv2.KeyPoint]:
-        """BRISK corners outside people; its threshold follows the texture."""
+        """Detects BRISK corners outside people; the threshold adapts to texture."""
         wanted = self.config.num_points
         free = None if mask is None else cv2.bitwise_not(mask)
         while True:
@@ -276,14 +281,14 @@ class _Tracker:
             inside = self._inside(uv, mask)
             if len(found) > 15 * wanted:
                 self.threshold = min(round(self.threshold * 1.3), 80)
-            elif inside.sum() < 3 * wanted and self.threshold > _LEAST_CONTRAST:
-                self.threshold = max(round(self.threshold / 1.5), _LEAST_CONTRAST)
+            elif inside.sum() < 3 * wanted and self.threshold > _MIN_BRISK_THRESHOLD:
+                self.threshold = max(round(self.threshold / 1.5), _MIN_BRISK_THRESHOLD)
                 if inside.sum() < wanted:
                     continue
             return [p for p, ok in zip(found, inside, strict=True) if ok]
 
     def _remember(self, gray: np.ndarray) -> None:
-        """Describes the points of this frame, so that they can be found again."""
+        """Adds a keyframe with the descriptors of this frame's points."""
         points = []
         for row, (i, (x, y)) in enumerate(
             zip(self.live.ids, self.live.uv, strict=True)
@@ -316,7 +321,7 @@ class _Tracker:
             then, guess = key.uv[lost[pairs[:, 0]]], candidates[pairs[:, 1]]
             now, ok = self._flow(key.image, gray, then, guess, 1)
             back, ok_back = self._flow(gray, key.image, now, then, 1)
-            ok &= ok_back & (np.linalg.norm(back - then, axis=-1) < _ROUND_TRIP)
+            ok &= ok_back & (np.linalg.norm(back - then, axis=-1) < _MAX_ROUND_TRIP_PX)
             ok &= np.linalg.norm(now - guess, axis=-1) < 4.0
             ids, then, now = key.ids[lost[pairs[ok, 0]]], then[ok], now[ok]
             _, a, b = np.intersect1d(key.ids, self.live.ids, return_indices=True)
@@ -325,6 +330,6 @@ class _Tracker:
             inlier = epipolar_inliers(
                 self._normalise(np.concatenate([key.uv[a], then])),
                 self._normalise(np.concatenate([self.live.uv[b], now])),
-                _EPIPOLAR_LIMIT / self.K[0, 0],
+                _MAX_EPIPOLAR_DISTANCE_PX / self.K[0, 0],
             )[len(a) :]
             self.live = self.live.add(ids[inlier], now[inlier])

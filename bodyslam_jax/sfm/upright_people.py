@@ -1,4 +1,4 @@
-"""How plausible people are under a camera model and its map, from keypoints alone.
+"""Plausibility of people under a camera model and its map, from keypoints alone.
 
 Two cues that need no body: people are upright over the ground of the map, and keep
 their size while they walk over it. A wrong camera bends and tilts the map, so that the
@@ -15,16 +15,16 @@ from bodyslam_jax.sfm.sfm import Reconstruction
 from bodyslam_jax.types import Intrinsics, Keypoints
 
 _NECK, _HIPS, _ANKLES = 1, 8, (11, 14)
-"""BODY_25."""
-_LEAN = np.radians(4.0)
+"""Indices of keypoints in BODY_25."""
+_LEAN_SIGMA_RAD = np.radians(4.0)
 """Standard deviation of a person's mean lean across the view from the normal of the
 ground: 2 degrees of trunks, and of ground that slopes by up to 4."""
-_SIZE = 0.03
-"""Standard deviation of the distance from neck to ankles, relative to a person's mean:
-it changes by so much within a step."""
-_TAIL = 4.0
+_SIZE_SIGMA = 0.03
+"""Standard deviation of the distance from neck to ankles, relative to a person's mean,
+by its change within a step."""
+_STUDENT_FREEDOM = 4.0
 """Degrees of freedom of Student's distribution: people also bend, sit and jump."""
-_FEWEST_FRAMES = 8
+_MIN_FRAMES = 8
 
 
 def plausibility(
@@ -33,13 +33,14 @@ def plausibility(
     people: Keypoints | None,
     zoom: Float[np.ndarray, " t"],
 ) -> float:
-    """Log-likelihood of people's lean and of the scatter of their size.
+    """Returns the log-likelihood of people's lean and of the scatter of their size.
 
-    0 without people or a ground that they stand on. Each person counts once: lean and
-    size last as long as the person is seen.
+    It is 0 without people or a ground that they stand on. Each person counts once, as
+    errors of lean and size persist while the person is seen.
 
     Args:
-        zoom: logarithm of each frame's focal length over that of `intrinsics`.
+        zoom: logarithm of the ratio of each frame's focal length to that of
+            `intrinsics`.
     """
     if people is None or found.kind != "moving":
         return 0.0
@@ -59,24 +60,27 @@ def plausibility(
     total = 0.0
     for person, frames in zip(xy, seen, strict=True):
         which = np.flatnonzero(frames)
-        if len(which) < _FEWEST_FRAMES:
+        if len(which) < _MIN_FRAMES:
             continue
         lean, size = _lean_and_size(person[which], found.T_WC[which], plane)
         if not len(size):
             continue
         scatter = 1.4826 * np.median(np.abs(np.log(size / np.median(size))))
-        total += _student(np.median(lean) / _LEAN) + _student(scatter / _SIZE)
+        total += _student(np.median(lean) / _LEAN_SIGMA_RAD) + _student(
+            scatter / _SIZE_SIGMA
+        )
     return total
 
 
 def _student(x: float) -> float:
-    return float(-(_TAIL + 1) / 2 * np.log1p(x**2 / _TAIL))
+    return float(-(_STUDENT_FREEDOM + 1) / 2 * np.log1p(x**2 / _STUDENT_FREEDOM))
 
 
 def _roughly_up(
     xy: Float[np.ndarray, "h t 25 2"], seen: np.ndarray, found: Reconstruction
 ) -> Float[np.ndarray, " 3"] | None:
-    """Mean direction of trunks as if they were parallel to the image."""
+    """Returns the mean direction of trunks in the world, as if they were parallel to
+    the image; `None` without people."""
     h, t = np.nonzero(seen)
     if not len(h):
         return None
@@ -91,8 +95,9 @@ def _lean_and_size(
     T_WC: Float[np.ndarray, "t 4 4"],
     plane: Float[np.ndarray, " 4"],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Angle of the trunk from the ground's normal in each image, rad; and the height of
-    the neck over the feet, in units of the map, where feet are on the ground."""
+    """Returns the angle of the trunk from the ground's normal in each image, rad, and
+    the height of the neck over the feet, in units of the map, where feet are on the
+    ground."""
     R, eye = T_WC[:, :3, :3], T_WC[:, :3, 3]
     normal = np.einsum("tij,i->tj", R, plane[:3])
     hips = xy[:, _HIPS]

@@ -1,4 +1,4 @@
-"""Zoom of a camera that only rotates: detection, and removal from tracks and images.
+"""Detects the zoom of a camera that only rotates; removes it from tracks and images.
 
 Rotation and zoom map directions by a rotation and a scale about the principal point.
 Forward motion scales near points more than far ones: over an interval in which the
@@ -17,60 +17,62 @@ from bodyslam_jax.geometry.triangulation import unit_rays
 from bodyslam_jax.sfm.bundle import Views
 from bodyslam_jax.types import Tracks
 
-LEAST_ZOOM = 0.04
-"""Logarithm of the ratio of focal lengths from which a zoom is reported."""
-_LINK = 5
-"""Frames between two of the chain."""
-_FEWEST = 20
-_PAIRS = 12
-_BETTER = 3.0
+MIN_LOG_ZOOM = 0.04
+"""Least logarithm of the ratio of focal lengths for which a zoom is reported."""
+_LINK_FRAMES = 5
+"""Number of frames between two links of the chain."""
+_MIN_SHARED_POINTS = 20
+_MAX_PAIRS = 12
+"""Largest number of pairs of frames that test the zoom."""
+_MIN_RESIDUAL_RATIO = 3.0
 """Least ratio of the residuals of a rotation without and with a scale."""
 
 
 def turning_zoom(
     views: Views, num_frames: int, limit: float
 ) -> Float[np.ndarray, " t"] | None:
-    """Logarithm of the focal length of a camera that turns and zooms, 0 at first; None
-    if it does not zoom, or if that is not all that it does.
+    """Returns the logarithm of the focal length of a camera that turns and zooms,
+    relative to the first frame; `None` if it does not zoom, or moves otherwise.
 
     Args:
-        limit: error at depth 1 that a right model leaves at most (median).
+        limit: largest median error, at depth 1, of a correct model.
     """
     order = np.argsort(views.frame, kind="stable")
     bounds = np.searchsorted(views.frame[order], np.arange(num_frames + 1))
     of_frame = [order[i:j] for i, j in zip(bounds[:-1], bounds[1:], strict=True)]
 
     def pair(a: int, b: int, before: float) -> tuple[float, float, float] | None:
-        """Of frames a and b, the first of which is scaled by `before` already."""
+        """Returns `_turn_and_scale` of frames a and b, both
+        scaled by `exp(-before)`."""
         ids = views.landmark[of_frame[a]], views.landmark[of_frame[b]]
         _, i, j = np.intersect1d(*ids, return_indices=True)
-        if len(i) < _FEWEST:
+        if len(i) < _MIN_SHARED_POINTS:
             return None
         size = np.exp(-before)
         xy = size * views.xy[of_frame[a][i]], size * views.xy[of_frame[b][j]]
         return _turn_and_scale(*xy, limit)
 
-    at = np.unique(np.r_[np.arange(0, num_frames, _LINK), num_frames - 1])
+    at = np.unique(np.r_[np.arange(0, num_frames, _LINK_FRAMES), num_frames - 1])
     log_scale = np.zeros(len(at))
     for i, (a, b) in enumerate(zip(at[:-1], at[1:], strict=True)):
         found = pair(int(a), int(b), float(log_scale[i]))
         log_scale[i + 1] = log_scale[i] + (found[0] if found else 0.0)
-    if np.ptp(log_scale) < LEAST_ZOOM:
+    if np.ptp(log_scale) < MIN_LOG_ZOOM:
         return None
-    # Pairs that are as far apart in scale as tracks last.
+    # Pairs with the largest change of scale that still share tracks.
     change = np.abs(log_scale[:, None] - log_scale)
-    i, j = np.nonzero(np.triu(change >= LEAST_ZOOM))
+    i, j = np.nonzero(np.triu(change >= MIN_LOG_ZOOM))
     judged = []
     for k in np.argsort(-change[i, j], kind="stable"):
         found = pair(int(at[i[k]]), int(at[j[k]]), float(log_scale[i[k]]))
         if found is not None:
             judged.append(found[1:])
-        if len(judged) == _PAIRS:
+        if len(judged) == _MAX_PAIRS:
             break
     if not judged:
         return None
     with_scale, without = np.median(judged, axis=0)
-    if with_scale > limit or without < _BETTER * with_scale:
+    if with_scale > limit or without < _MIN_RESIDUAL_RATIO * with_scale:
         return None
     return np.interp(np.arange(num_frames), at, log_scale)
 
@@ -78,7 +80,8 @@ def turning_zoom(
 def _turn_and_scale(
     xy_a: np.ndarray, xy_b: np.ndarray, scale: float
 ) -> tuple[float, float, float]:
-    """Logarithm of the scale, median error with it and with a rotation alone."""
+    """Returns the logarithm of the scale, and the median errors of a rotation with a
+    scale and of a rotation alone."""
     away = []
     for free in (False, True):
         turn, log_s, r = np.eye(3), 0.0, xy_a - xy_b
@@ -105,7 +108,7 @@ def _turn_and_scale(
 def tracks_without_zoom(
     tracks: Tracks, zoom: Float[np.ndarray, " t"], centre: Float[np.ndarray, "2"]
 ) -> Tracks:
-    """The tracks as one focal length would have them: scaled about the centre (px)."""
+    """Returns the tracks scaled about the centre (px) to one focal length."""
     size = np.exp(-zoom)[tracks.frame][:, None]
     uv = centre + (tracks.uv - centre) * size
     return Tracks(tracks.frame, tracks.landmark, uv, tracks.warnings)
@@ -116,7 +119,8 @@ def without_zoom(
     zoom: Float[np.ndarray, " t"],
     centre: Float[np.ndarray, "2"],
 ) -> Iterator[UInt8[np.ndarray, "y x *c"]]:
-    """The images as one focal length would have them; black where they show nothing."""
+    """Yields the images scaled about the centre (px) to one focal length; black where
+    they have no pixels."""
     for image, log_size in zip(images, zoom, strict=False):
         size = float(np.exp(-log_size))
         shift = (1 - size) * np.asarray(centre, float)

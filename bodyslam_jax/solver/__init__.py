@@ -1,4 +1,4 @@
-"""How a problem is solved: structure, linear algebra, steps, baselines, uncertainty."""
+"""Solves factor-graph problems by structured Levenberg-Marquardt; covariances."""
 
 from bodyslam_jax.solver.batching import vmap_over_devices as vmap_over_devices
 from bodyslam_jax.solver.compilation import quick_options as quick_options

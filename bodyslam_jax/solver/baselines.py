@@ -1,9 +1,9 @@
-"""Stock solvers, as cross-checks and to be measured against; for small problems.
+"""Stock solvers for small problems, as cross-checks and baselines of benchmarks.
 
 They see a flat step from the first state (poses do not add, steps do) and the lifted
-residuals. The motion model's prediction is made anew, and held, in each step of Adam.
-In the others it stays as it is at the start of a stage. Each is one program with all
-that it needs.
+residuals. Adam predicts the motion anew in each step, and holds the prediction in its
+gradient. The others keep the prediction at the start of a stage. Each is one compiled
+program.
 """
 
 import math
@@ -22,19 +22,21 @@ from bodyslam_jax.solver.blocks import mask_of
 from bodyslam_jax.solver.levenberg_marquardt import lifted
 from bodyslam_jax.solver.solution import is_finite
 
-ADAM_RATE = 1e-2
-DENSE_LIMIT = 20_000_000
-"""Entries of a dense Jacobian, 160 MB in double precision: above, `optimistix_lm` and
-`jaxopt_lm` are refused."""
-SETTLED = 10
-"""First-order steps over which the cost must stay as it is."""
+ADAM_LEARNING_RATE = 1e-2
+"""Length of a step, in the units of each coordinate of a step."""
+MAX_DENSE_ENTRIES = 20_000_000
+"""Largest number of entries of a dense Jacobian, 160 MB in double precision; for more,
+`optimistix_lm` and `jaxopt_lm` are refused."""
+SETTLING_STEPS = 10
+"""Number of first-order steps over which the cost of a converged solve is constant."""
 
 
 def run(name, problem, state, stage):
-    """One stage of the solver of this name: state, its cost, steps and result.
+    """Runs one stage of a solver; returns the state, its cost,
+    the steps and the result.
 
-    A state that is not finite, or whose cost is not, is not returned: the one that the
-    stage began with is.
+    In place of a state that is not finite, or whose cost is not, it returns the one
+    that the stage began with.
     """
     cost_of = problem.cost
     before = cost_of(state)
@@ -56,12 +58,12 @@ def check_size(name: str, problem: Problem, state: State) -> None:
     rows = jax.eval_shape(lambda s: lifted(s, problem), state)
     count = sum(math.prod(row.shape) for row in rows)
     unknowns = sum(x.size for x in jax.tree.leaves(problem.free))
-    if count * unknowns > DENSE_LIMIT:
+    if count * unknowns > MAX_DENSE_ENTRIES:
         raise ValueError(
             f"solver: {name} is for small problems, as its Jacobian is dense: found "
             f"{count:,} residuals by {unknowns:,} unknowns ({len(state.cameras)} "
             f"frames, {len(state.landmarks)} landmarks), expected a product below "
-            f"{DENSE_LIMIT:,}; use `structured` or `adam`."
+            f"{MAX_DENSE_ENTRIES:,}; use `structured` or `adam`."
         )
 
 
@@ -82,7 +84,7 @@ class _Flat(eqx.Module):
         return jnp.concatenate([r.reshape(-1) for r in rows])
 
     def cost(self, step):
-        """With the motion predicted anew, and held."""
+        """Returns the cost after a step, with the motion predicted there, and held."""
         return self.problem.cost(self.retract(step))
 
 
@@ -96,14 +98,14 @@ def _residual(step, flat):
 
 
 def _held_rows(step, flat):
-    """Residuals, and rows that hold what no measurement sees: a dense system must not
-    be singular."""
+    """Returns residuals, and weak rows on all coordinates, without which those that no
+    measurement sees would make a dense system singular."""
     held = jax.tree.map(lambda s: 1e-9 * s, step)
     return flat.residual(step), held
 
 
 def optimistix_lm(problem, state, stage):
-    """Stock Levenberg-Marquardt of optimistix, dense, by QR."""
+    """Runs the Levenberg-Marquardt of optimistix, dense, by QR."""
     flat, zero = _flat(problem, state)
     method = optx.LevenbergMarquardt(
         rtol=stage.rtol, atol=stage.rtol, linear_solver=lx.QR()
@@ -115,8 +117,8 @@ def optimistix_lm(problem, state, stage):
 
 
 def optimistix_cg(problem, state, stage, inner_steps=500):
-    """The same with conjugate gradients on the normal equations, of unknowns in units
-    in which each matters as much: they do not converge in others."""
+    """Runs the Levenberg-Marquardt of optimistix with conjugate gradients on the normal
+    equations, which converge only for unknowns scaled to columns of unit length."""
     flat, zero = _flat(problem, state)
     unit = _units(flat, zero)
     inner = lx.Normal(lx.CG(rtol=1e-6, atol=1e-6, max_steps=inner_steps))
@@ -135,15 +137,16 @@ def _scaled_rows(step, given):
     return _held_rows(jax.tree.map(jnp.multiply, unit, step), flat)
 
 
-PROBES = 64
+NUM_SIGN_PROBES = 64
+"""Random sign vectors that estimate the lengths of columns: to about a tenth."""
 
 
 @eqx.filter_jit
 def _units(flat, zero):
-    """One over the lengths of the columns of the Jacobian, by random signs: to about a
-    tenth."""
+    """Estimates one over the lengths of the columns of the
+    Jacobian, by random signs."""
     residual, pull = jax.vjp(flat.residual, zero)
-    keys = jax.random.split(jax.random.key(0), PROBES)
+    keys = jax.random.split(jax.random.key(0), NUM_SIGN_PROBES)
     signs = lambda key: jax.random.rademacher(key, residual.shape, residual.dtype)
     squares = jax.lax.map(
         lambda key: jax.tree.map(jnp.square, pull(signs(key))[0]), keys
@@ -153,7 +156,7 @@ def _units(flat, zero):
 
 
 def jaxopt_lm(problem, state, stage):
-    """Levenberg-Marquardt of jaxopt, dense."""
+    """Runs the Levenberg-Marquardt of jaxopt, dense."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         import jaxopt
@@ -165,7 +168,7 @@ def jaxopt_lm(problem, state, stage):
         whole = eqx.combine(arrays, static)
         return jnp.concatenate([whole.residual(unravel(x)), 1e-9 * x])
 
-    # Of the largest slope at the start: by itself it depends on what costs are of.
+    # Relative to the largest slope at the start: an absolute one has the cost's units.
     slope = jax.lax.stop_gradient(jax.grad(flat.cost)(zero))
     slope = jnp.abs(ravel_pytree(slope)[0]).max()
     method = jaxopt.LevenbergMarquardt(
@@ -176,10 +179,10 @@ def jaxopt_lm(problem, state, stage):
         solver="cholesky",
         materialize_jac=True,
     )
-    # jaxopt multiplies truth values and numbers.
+    # jaxopt multiplies booleans and numbers.
     with jax.numpy_dtype_promotion("standard"):
         found = method.run(start, arrays)
-    # Where rounding lets no step lower the cost, it tries ever shorter ones.
+    # Where rounding hides any decrease, it tries ever shorter steps: converged, too.
     last = found.state
     least = 1e-12 * jnp.diag(jnp.max(jnp.diag(last.jtj)) * jnp.ones_like(start))
     step = jnp.linalg.solve(last.jtj + least, last.gradient)
@@ -198,24 +201,27 @@ def _result(converged):
 
 
 def adam(problem, state, stage):
-    """First-order steps, as the paper took: `stage.max_steps` of them.
+    """Takes `stage.max_steps` first-order steps, as the paper does.
 
-    Converged is what has kept its cost, within the stage's tolerance, for a while: the
-    steps are of fixed length and never end by themselves.
+    It counts as converged if the cost stayed within the stage's tolerance over the last
+    `SETTLING_STEPS`: the steps are of fixed length and never end by themselves.
     """
-    state, costs = adam_curve(problem, state, stage, ADAM_RATE)
+    state, costs = adam_curve(problem, state, stage, ADAM_LEARNING_RATE)
     finite, settled = jnp.isfinite(costs), jnp.array(False)
-    if len(costs) >= SETTLED:
+    if len(costs) >= SETTLING_STEPS:
         enough = jnp.maximum(stage.rtol * costs[-1], stage.atol)
-        settled = jnp.ptp(costs[-SETTLED:]) <= enough
+        settled = jnp.ptp(costs[-SETTLING_STEPS:]) <= enough
     result = _result(settled)
     result = optx.RESULTS.where(finite.all(), result, optx.RESULTS.nonfinite)
     return state, finite.sum(), result
 
 
 def adam_curve(problem, state, stage, rate, *, decays=False):
-    """The state after these steps, and the cost before each; `decays`: the rate falls
-    to 0 as a cosine does. Where the cost is not finite the steps end."""
+    """Returns the state after `stage.max_steps` of Adam, and the cost before each.
+
+    With `decays` the rate falls to 0 as a cosine does. Where the cost is not finite the
+    last state with a finite one is kept.
+    """
     flat, zero = _flat(problem, state)
     rate = jnp.asarray(rate, state.scale.dtype)
     found, costs = _adam(flat, zero, rate, stage.max_steps, decays)
@@ -232,7 +238,7 @@ def _adam(flat, start, rate, count, decays):
         cost, gradient = jax.value_and_grad(flat.cost)(step)
         good = jnp.isfinite(cost)
         known = jax.tree.map(lambda new, old: jnp.where(good, new, old), step, known)
-        # optax takes powers of Python's numbers.
+        # optax mixes arrays with Python numbers of other types.
         with jax.numpy_dtype_promotion("standard"):
             change, memory = method.update(gradient, memory)
             length = rate * falls(k) if decays else rate

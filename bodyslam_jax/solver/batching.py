@@ -1,4 +1,4 @@
-"""Many problems: one after another on a CPU, and a share of them on every device.
+"""Batches of problems: in turn on a CPU, and shared out among several devices.
 
 A core is busy with one problem. Mapped at once, small products become batches of small
 products, branches that one problem skips are taken for all, and memory grows with the
@@ -23,7 +23,7 @@ from bodyslam_jax.solver.compilation import quick_jit
 def sequential_vmap(
     function: Callable[..., Any], alone: Callable[..., Any] | None = None
 ) -> Callable[..., Any]:
-    """The same function of pytrees; on a CPU it is mapped one after another.
+    """Returns the function of pytrees such that `vmap` maps it in turn on a CPU.
 
     Within `jit` that is a loop in one program. Otherwise `alone`, the function as a
     compiled program, is called for each, so that mapping compiles nothing more.
@@ -69,22 +69,24 @@ def sequential_vmap(
     return call
 
 
-AXIS = "device"
+DEVICE_AXIS = "device"
+"""Name of the mesh axis over devices."""
 
 
 def vmap_over_devices(
     function: Callable[..., Any], in_axes: int | tuple[int | None, ...] = 0
 ) -> Callable[..., Any]:
-    """`jax.vmap(function, in_axes)`, compiled, a share of the batch on each device.
+    """Returns a compiled `jax.vmap(function, in_axes)` with the
+    batch shared among devices.
 
     On a CPU a core can be a device: `jax.config.update("jax_num_cpu_devices", 2)`
-    before anything else is asked of JAX. Six solves of 300 frames then take 0.6 of the
-    time that they take one after another. Of one device it is `jax.vmap`.
+    before any other use of JAX. Six solves of 300 frames then take 0.6 of the time that
+    they take one after another. With one device it is `jax.vmap`.
 
-    `in_axes` has 0 for arguments with a leading axis of the batch, `None` for those
-    that all share, as one number or one for each. Keep what this returns: calling it
-    again does not compile again. Batches of any size; results are on the first device,
-    what is no array in them is as the function gives it.
+    `in_axes` is 0 for arguments with a leading batch axis and `None` for shared ones,
+    as one value for all arguments or one for each. Keep the returned function: calling
+    it again does not compile again. Batches may have any size; results are on the first
+    device, and their leaves that are no arrays are those of the function.
 
     **Raises:** `ValueError` if no argument is mapped, or their leading axes differ.
     """
@@ -106,7 +108,9 @@ def vmap_over_devices(
         devices = tuple(jax.local_devices())[:batch]
         if is_traced(args) or not is_alone():
             return program(args, axes, devices, batch)
-        everywhere = NamedSharding(Mesh(np.array(devices), AXIS), PartitionSpec())
+        everywhere = NamedSharding(
+            Mesh(np.array(devices), DEVICE_AXIS), PartitionSpec()
+        )
         found = compiled()(_placed(args, everywhere), axes, devices, batch)
         return _placed(found, devices[0])
 
@@ -148,16 +152,16 @@ def _shared_out(function, args, axes, devices, batch):
     mapped = jax.vmap(one, in_axes=axes)
     if len(devices) == 1:
         return eqx.combine(mapped(*arrays), form)
-    # The last problem fills up what does not divide: its device would wait otherwise.
+    # The last problem is repeated to fill all devices, which would wait otherwise.
     each = -(-batch // len(devices))
-    # Dealt out one by one: neighbours, such as scales in order, take as many steps.
+    # Problems are dealt out one by one, as neighbours take about as many steps.
     turn = np.arange(each * len(devices)).reshape(each, len(devices)).T.ravel()
     row = np.minimum(turn, batch - 1)
     fill = lambda tree, axis: tree if axis is None else jax.tree.map(_rows(row), tree)
     arrays = tuple(fill(a, axis) for a, axis in zip(arrays, axes, strict=True))
-    part, whole = PartitionSpec(AXIS), PartitionSpec()
+    part, whole = PartitionSpec(DEVICE_AXIS), PartitionSpec()
     specs = tuple(part if axis == 0 else whole for axis in axes)
-    mesh = Mesh(np.array(devices), AXIS)
+    mesh = Mesh(np.array(devices), DEVICE_AXIS)
     spread = jax.shard_map(
         mapped,
         mesh=mesh,

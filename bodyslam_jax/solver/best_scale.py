@@ -26,41 +26,41 @@ from bodyslam_jax.graph import (
     squared_norm,
 )
 
-_STEPS = 20
-"""Of the search, at most: one for squared losses, some for robust ones."""
-_AROUND = tuple(2.0 ** (k / 2) for k in range(-10, 11))
-"""Where robust losses may have several minima, as shares of the s of least squares:
-between 1/32 and 32 of it, in steps that are narrower than what robust losses of sizes
-known to some ten per cent leave between two minima."""
-WORTH = 0.005
-"""Decrease of the cost, a negative log-likelihood, from which another s is better."""
+_MAX_NEWTON_STEPS = 20
+"""Maximum number of Newton steps: one suffices for squared losses."""
+_SCALE_GRID = tuple(2.0 ** (k / 2) for k in range(-10, 11))
+"""Starts for robust losses, which may have several minima, as shares of the s of least
+squares: between 1/32 and 32 of it, in steps narrower than the distance of two minima
+where sizes are known to some ten per cent."""
+MIN_SCALE_COST_DECREASE = 0.005
+"""Least decrease of the cost (negative log-likelihood) that makes another s better."""
 
 
 class _Model(NamedTuple):
-    """The terms that see s, at one s."""
+    """Cost and Newton steps, at one s, of the factors that depend on s."""
 
     cost: Float[Array, ""]
     step: Float[Array, ""]
-    """To the minimum of the squares, weighted by the robust losses."""
+    """Step to the minimum of the squares, weighted by the robust losses."""
     plain: Float[Array, ""]
-    """To the minimum of the squares, each with weight 1."""
+    """Step to the minimum of the squares, each with weight 1."""
 
 
 class _Search(NamedTuple):
-    """Where the search for s stands."""
+    """State of the search for s."""
 
     looked: Int[Array, ""]
-    """How many were looked at."""
+    """Number of s that were evaluated."""
     scale: Float[Array, ""]
-    """The next to be looked at."""
+    """The s to be evaluated next."""
     last: Float[Array, ""]
-    """The one looked at before, with its `step` and `cost`."""
+    """The s evaluated before, with its `step` and `cost`."""
     step: Float[Array, ""]
     cost: Float[Array, ""]
     start: Float[Array, ""]
-    """Cost of the first."""
+    """Cost at the first s."""
     around: Float[Array, ""]
-    """The s of least squares."""
+    """The s of least squares, at the centre of the grid."""
     least: Float[Array, ""]
     """Cost of the `best` so far."""
     best: Float[Array, ""]
@@ -69,24 +69,26 @@ class _Search(NamedTuple):
 def best_scale(
     problem: Problem, state: State, free: Bool[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The s of least cost given all else, and by how much less.
+    """Returns the s of least cost given all else, and the decrease of the cost.
 
-    The motion model's prediction is that in `problem`. Where it is not `free` the
-    scale stays, and so does one that no other is better than.
+    The motion model's prediction is that in `problem`. The scale of `state` is returned
+    where it is not `free`, and where no other is better.
     """
     sees = _factors_of_scale(problem)
     none = jnp.zeros_like(state.scale)
     if not sees or "scale" not in problem.variables:
         return state.scale, none
-    grid = jnp.asarray(() if is_quadratic(problem) else _AROUND, none.dtype)
+    grid = jnp.asarray(() if is_quadratic(problem) else _SCALE_GRID, none.dtype)
     eps = float(jnp.finfo(none.dtype).eps)
-    # The start, the grid, and what Newton's steps lead to from the best of these: one
-    # loop, so that the model stands in the program once.
+    # The start, the grid, and Newton's steps from the best of these are one loop, so
+    # that the model is compiled once.
     known = 1 + len(grid)
 
     def goes_on(search: _Search):
         small = jnp.abs(search.step) <= 4 * eps * jnp.abs(search.last)
-        return (search.looked < known + _STEPS) & ((search.looked < known) | ~small)
+        return (search.looked < known + _MAX_NEWTON_STEPS) & (
+            (search.looked < known) | ~small
+        )
 
     def once(search: _Search):
         count, scale = search.looked, search.scale
@@ -118,7 +120,7 @@ def best_scale(
 
 
 def is_quadratic(problem: Problem) -> bool:
-    """Whether no factor that sees s has a robust loss, so that there is one best s."""
+    """Returns True if no factor that depends on s is robust: s is unique then."""
     return all(isinstance(f.loss, Squared) for f in _factors_of_scale(problem))
 
 
@@ -151,7 +153,7 @@ def _model(factors: list[Factor], state: State, scale: Float[Array, ""]) -> _Mod
 
 
 def _newton(slope: Float[Array, ""], bend: Float[Array, ""]) -> Float[Array, ""]:
-    """The step to the minimum of a parabola; 0 if it is none."""
+    """Returns the step to the minimum of a parabola; 0 if it has none."""
     seen = bend > 0
     step = -slope / jnp.where(seen, bend, 1.0)
     return jnp.where(seen & jnp.isfinite(step), step, 0.0)

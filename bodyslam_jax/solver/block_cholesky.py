@@ -1,8 +1,8 @@
 """Factorises the system of chunks, from one end to the other.
 
-Before a chunk is factorised, all that the chunks before it leave on it is taken from it
-at once ("left-looking"): nothing is carried along but the factors themselves. Chunks
-are taken as they stand: in the order of time, or of what they see (`Layout.order`).
+Before a chunk is factorised, the updates of all chunks before it are subtracted from it
+at once ("left-looking"): only the factors themselves are carried along. Chunks are
+taken as they stand: in the order of time, or in that of `Layout.order`.
 """
 
 import equinox as eqx
@@ -19,7 +19,7 @@ from bodyslam_jax.solver.triangular import half_of
 
 
 class Factor(eqx.Module):
-    """Each chunk, factorised, and what is left of the arrow."""
+    """Cholesky factors of all chunks, and the Schur complement of the arrow."""
 
     half: Float[Array, "n q q"]
     """`L^-1` of each pivot."""
@@ -29,7 +29,7 @@ class Factor(eqx.Module):
 
 
 def factorise(chunks: Chunks, sizes: Sizes, layout: Layout) -> Factor:
-    """One chunk after another, less what those before it left on it.
+    """Factorises one chunk after another, left-looking.
 
     Only chunks in use are factorised, over the bandwidth in use.
     """
@@ -43,13 +43,13 @@ def factorise(chunks: Chunks, sizes: Sizes, layout: Layout) -> Factor:
     def step(sides, chunk):
         k, pivot, coupling = chunk
         people, later, common = coupling[:near], coupling[near:-tail], coupling[-tail:]
-        # What lies before the first chunk is not written yet: zeros.
+        # Sides before the first chunk wrap around to rows not yet written: zeros.
         side_of = lambda back: row_of(sides, jax.lax.rem(k - back + n, np.int32(n)))
         for back in range(1, with_people + 1):
             before = side_of(back)
             first, start = (back - 1) * head, near + (back - 1) * CAMERAS
             rows = jnp.concatenate([before[first:near], before[start:]])
-            # Of people and of cameras this chunk's come first.
+            # Rows of this chunk come first, both among people and among cameras.
             beside = near - first - head
             width = head + CAMERAS
             own = _without(rows[: width + beside], head, beside)
@@ -96,14 +96,14 @@ def factorise(chunks: Chunks, sizes: Sizes, layout: Layout) -> Factor:
 
 
 def _without(rows, first, count):
-    """All rows but `count` of them."""
+    """Returns the rows without `count` of them from `first` on."""
     return jnp.concatenate([rows[:first], rows[first + count :]]) if count else rows
 
 
 def back_substitute(
     factor: Factor, sizes: Sizes
 ) -> tuple[Float[Array, "n q"], Float[Array, " a"]]:
-    """Steps of all chunks, as they stand, and of the arrow."""
+    """Returns the steps of all chunks, as they stand, and of the arrow."""
     n, r, q = factor.side.shape
     g = sizes.arrow
     head = q - CAMERAS
@@ -114,7 +114,7 @@ def back_substitute(
 
     def step(following, chunk):
         half, side = chunk
-        # -1 for the right-hand side: the whole table, without a copy of a part.
+        # A factor of -1 for the right-hand side saves copying a part of the table.
         known = jnp.concatenate([following, common, -jnp.ones_like(common[:1])])
         here = -half.T @ (known @ side)
         people, cameras = following[: near - head], following[near:-CAMERAS]

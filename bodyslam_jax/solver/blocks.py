@@ -1,4 +1,4 @@
-"""The blocks of the normal equations, and how many of them there are.
+"""The blocks of the normal equations, and their sizes.
 
 Names of blocks: `("pose", "root", d)` couples the pose of frame k with the root of
 frame k - d; `alone` is a camera without a person.
@@ -24,42 +24,42 @@ class Sizes(eqx.Module):
     chunks: int = eqx.field(static=True)
     bandwidth: int = eqx.field(static=True)
     reach: int = eqx.field(static=True)
-    """Places between a chunk and the next in time, at most."""
+    """Largest distance, in the order of elimination, of chunks adjacent in time."""
     intrinsics: int = eqx.field(static=True)
-    """0 where they are held."""
+    """Number of intrinsics; 0 where they are held."""
     named: int = eqx.field(static=True)
-    """Coordinates of named globals; 0 where they are held."""
+    """Number of coordinates of named globals; 0 where they are held."""
     variables: tuple[str, ...] = eqx.field(static=True)
     lasting: int = eqx.field(static=True)
-    """Landmarks that are eliminated last."""
+    """Number of landmarks that are eliminated last."""
     posture: int = eqx.field(static=True)
-    """Coordinates of a posture (`posture.py`)."""
+    """Number of coordinates of a posture (`posture.py`)."""
     dtype: np.dtype = eqx.field(static=True)
-    """Of blocks and factors: the state's, or a lower one (see `solve`)."""
+    """Precision of blocks and factors: the state's, or a lower one (see `solve`)."""
 
     @property
     def common(self) -> int:
-        """Scale, intrinsics and named globals: what no single person has."""
+        """Width of scale, intrinsics and named globals, which no single person owns."""
         return 1 + self.intrinsics + self.named
 
     @property
     def own_globals(self) -> int:
-        """Scale, intrinsics, named globals and the shape of one person."""
+        """Width of scale, intrinsics, named globals and the shape of one person."""
         return self.common + 10
 
     @property
     def globals(self) -> int:
-        """Scale, intrinsics, named globals and all shapes."""
+        """Width of scale, intrinsics, named globals and all shapes."""
         return self.common + 10 * self.people
 
     @property
     def arrow(self) -> int:
-        """What is eliminated last: globals, then lasting landmarks."""
+        """Width of what is eliminated last: globals, then lasting landmarks."""
         return self.globals + 3 * self.lasting
 
 
 class LandmarkBlocks(eqx.Module):
-    """One bucket: `n` groups of `g` landmarks over `f` frames."""
+    """Blocks of one bucket: `n` groups of `g` landmarks over `f` frames."""
 
     cross: Float[Array, "n f 6 3 g"]
     """Camera against landmark."""
@@ -69,12 +69,12 @@ class LandmarkBlocks(eqx.Module):
 
 
 class PriorBlocks(eqx.Module):
-    """`J^T J` of a `MarginalPrior`: of people in the first chunk, cameras of the first
+    """`J^T J` of a `MarginalPrior` over people in the first chunk, cameras of the first
     chunks, and globals."""
 
     matrix: Float[Array, "d d"]
     person: int = eqx.field(static=True)
-    """Coordinates of a person: the last posture, then the last roots."""
+    """Number of coordinates of a person: the last posture, then the last roots."""
     reach: int = eqx.field(static=True)
     """Number of these roots."""
 
@@ -83,19 +83,19 @@ class Linearisation(eqx.Module):
     """Blocks of `J^T J` and of the gradient `J^T r` at a state, and its cost."""
 
     blocks: dict[tuple[str, str, int], Array]
-    """Per person (but for cameras alone) and frame."""
+    """Blocks by person (except for cameras alone) and frame."""
     gradient: dict[str, Array]
     globals: Float[Array, "g g"]
     globals_gradient: Float[Array, " g"]
     landmarks: tuple[LandmarkBlocks, ...]
     costs: Float[Array, " k"]
-    """Of each factor."""
+    """Cost of each factor."""
     prior: PriorBlocks | None = None
-    """Its globals' own block is in `globals`."""
+    """Blocks of the marginal prior, whose globals' own block is in `globals`, too."""
 
 
 def cast(tree, dtype: np.dtype):
-    """All real numbers of a tree in another precision."""
+    """Converts all floating-point arrays of a tree to another precision."""
     change = lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x
     return jax.tree.map(change, tree)
 
@@ -109,13 +109,13 @@ class Observations(eqx.Module):
 
     pixel: Float[Array, "u b 2 g"]
     weight: Float[Array, "u b g"]
-    """1 / sigma; 0 in the holes."""
+    """1 / sigma; 0 where there is no observation."""
     chunk: Int[Array, " u"]
     landmark: Int[Array, "u g"]
 
 
 class Sums:
-    """Adds blocks up by name, while tracing."""
+    """Accumulates blocks by name, while tracing."""
 
     def __init__(self, sizes: Sizes, state: State):
         self.sizes = sizes
@@ -136,14 +136,14 @@ class Sums:
         self.gradient[name] = value if known is None else known + value
 
     def add_globals(self, person: int | None, hessian: Array, gradient: Array) -> None:
-        """Adds what one person's own globals (or the camera's) gathered."""
+        """Adds blocks over the globals of one person, or, with None, of no person."""
         index = own_to_global(self.sizes, person)
         self.globals = self.globals.at[index[:, None], index[None, :]].add(hessian)
         self.globals_gradient = self.globals_gradient.at[index].add(gradient)
 
 
 def shifted(x: Array, by: int, axis: int) -> Array:
-    """Row k of an axis to row k + by, either way; zeros come in."""
+    """Moves row k of an axis to row k + by, either way; zeros come in."""
     size = x.shape[axis]
     kept = jax.lax.slice_in_dim(x, max(-by, 0), size - max(by, 0), axis=axis)
     come_in = jnp.zeros_like(jax.lax.slice_in_dim(x, 0, abs(by), axis=axis))
@@ -151,7 +151,7 @@ def shifted(x: Array, by: int, axis: int) -> Array:
 
 
 def sizes_of(problem: Problem, state: State, dtype: np.dtype | None = None) -> Sizes:
-    """`dtype` of blocks, the state's without it."""
+    """Returns the sizes of a problem; `dtype` defaults to the state's precision."""
     size = lambda name, x: x.shape[0] if name in problem.variables else 0
     return Sizes(
         people=state.roots.shape[0],
@@ -168,7 +168,7 @@ def sizes_of(problem: Problem, state: State, dtype: np.dtype | None = None) -> S
 
 
 def mask_of(problem: Problem) -> Step:
-    """The problem's mask, 0 for groups that are not among its variables."""
+    """Returns the problem's mask, 0 for groups that are not among its variables."""
     parts = {
         name: value if name in problem.variables else jnp.zeros_like(value)
         for name, value in vars(problem.free).items()
@@ -177,7 +177,7 @@ def mask_of(problem: Problem) -> Step:
 
 
 def globals_of(step: Step, sizes: Sizes) -> Float[Array, " g"]:
-    """All globals of a step in one vector, in the order of the arrowhead's corner."""
+    """Returns all globals of a step in one vector, in the order of the corner."""
     return jnp.concatenate(
         [
             step.scale[None],
@@ -189,8 +189,8 @@ def globals_of(step: Step, sizes: Sizes) -> Float[Array, " g"]:
 
 
 def own_to_global(sizes: Sizes, person: int | None) -> Array:
-    """Where scale, intrinsics, named globals and the shape of a person stand among all
-    globals."""
+    """Returns the indices of scale, intrinsics, named globals and the person's shape
+    (none for `None`) among all globals."""
     common = jnp.arange(sizes.common)
     if person is None:
         return common

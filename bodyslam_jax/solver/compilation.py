@@ -1,4 +1,4 @@
-"""How the solver's programs are compiled."""
+"""Compiler options and precision of the solver's programs."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -10,17 +10,17 @@ import jax.numpy as jnp
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_OPTIONS = {
+_XLA_CPU_OPTIONS = {
     "xla_cpu_use_fusion_emitters": False,
     "xla_llvm_disable_expensive_passes": True,
 }
-"""Of XLA's two code generators for fused operations on a CPU, the older one, and LLVM
-without its expensive passes: the solver's program compiles in half the time with the
-first and in 0.7 of that with both, and runs as fast."""
+"""Options select the older of XLA's two code generators for fused operations on a CPU,
+and LLVM without its expensive passes: the solver's program compiles in half the time
+with the first and in 0.7 of that with both, and runs as fast."""
 
 
 def compiled(function: F) -> F:
-    """`eqx.filter_jit` with `quick_options`, read at the first call.
+    """Returns `eqx.filter_jit` with `quick_options`, which are read at the first call.
 
     Options belong to whole programs: inside a larger `jit` use `eqx.filter_jit`.
     """
@@ -34,13 +34,13 @@ def compiled(function: F) -> F:
 
 
 def quick_jit(function: Callable[..., Any]) -> Any:
-    """`eqx.filter_jit` with `quick_options`: called like `function`, with `lower`."""
+    """Returns `eqx.filter_jit` with `quick_options`, which has `lower` as well."""
     filter_jit: Any = eqx.filter_jit  # its annotation leaves JAX's own options out
     return filter_jit(function, compiler_options=quick_options())
 
 
 def in_full_precision(function: F) -> F:
-    """The same with full-precision matrix products, where a GPU would keep ten bits."""
+    """Returns the function with matrix products in full precision, not TF32."""
 
     @functools.wraps(function)
     def call(*args, **kwargs):
@@ -52,11 +52,13 @@ def in_full_precision(function: F) -> F:
 
 @functools.cache
 def quick_options() -> Mapping[str, bool] | None:
-    """Options that shorten compilation for a CPU, those that this version of XLA knows;
-    `None` if it knows none, and on other devices."""
+    """Returns the options that shorten compilation for a CPU, as far as this version of
+    XLA knows them; `None` if it knows none, and on other devices."""
     if jax.default_backend() != "cpu":
         return None
-    return {name: x for name, x in _OPTIONS.items() if _is_known(name, x)} or None
+    return {
+        name: x for name, x in _XLA_CPU_OPTIONS.items() if _is_known(name, x)
+    } or None
 
 
 def _is_known(name: str, value: bool) -> bool:

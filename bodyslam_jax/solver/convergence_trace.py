@@ -1,4 +1,4 @@
-"""A solve that is watched: what it is asked for, or the clock, after each iteration."""
+"""Solves that record a function of the state, or the time, after each iteration."""
 
 import time
 from collections.abc import Callable
@@ -99,12 +99,13 @@ def clock(
     damping: float = 1e-4,
     mixed_precision: bool = False,
 ) -> tuple[Solution, tuple[np.ndarray, ...]]:
-    """`solve` with the wall time of each iteration, s, for each stage.
+    """Solves as `solve` does, and returns the wall time of each iteration, s, by stage.
 
     `solve` itself is one compiled loop in which no clock can be read: a call back to
-    Python would wait for each step, and its program would neither map nor be kept from
-    run to run. Here the same step is a program of its own, called from Python, compiled
-    before the clock runs; only passing the loop's state in and out comes on top.
+    Python would wait for each step, and its program could be neither mapped nor cached
+    between runs. Here the same step is a program of its own, called from Python,
+    compiled before the clock runs; only passing the loop's state in and out comes on
+    top.
 
     **Raises:** `ValueError` as `solve`.
     """
@@ -149,5 +150,5 @@ def _advance(method, problem, state, arrays, static):
 
 
 def _residuals(state, problem):
-    """What optimistix calls a function: residuals, and no further output."""
+    """Returns residuals and no auxiliary output, the signature optimistix expects."""
     return lifted(state, problem), None

@@ -1,7 +1,11 @@
-"""How sure an estimate is: marginal covariances of what a user asks about.
+"""Marginal covariances of an estimate.
 
-From the inverse of the normal equations where it is needed (`selected_inverse.py`).
-Coordinates that are held are known exactly.
+They are blocks of the inverse of the normal equations, of which only those that are
+needed are formed (`selected_inverse.py`). Coordinates that are held are known exactly.
+
+`marginals` takes its equations from the loop that `solve` has compiled, and a loop of
+unknown length has no derivative backwards. `_equations` forms the same ones without it,
+for the derivative alone, which takes a compilation of its own.
 """
 
 import dataclasses
@@ -24,45 +28,54 @@ from bodyslam_jax.solver.blocks import (
     sizes_of,
 )
 from bodyslam_jax.solver.compilation import compiled, in_full_precision
-from bodyslam_jax.solver.covariance_vjp import equations
 from bodyslam_jax.solver.elimination.schur import half_inverse
 from bodyslam_jax.solver.front import window_of
-from bodyslam_jax.solver.linear_system import UNSEEN, damped, diagonals
+from bodyslam_jax.solver.levenberg_marquardt import final_of
+from bodyslam_jax.solver.linear_system import (
+    UNOBSERVED_DIAGONAL,
+    damped,
+    diagonals,
+    eliminate,
+)
+from bodyslam_jax.solver.linearise import linearise
+from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.lm_state import Final
 from bodyslam_jax.solver.long_tracks import lasting_spread
 from bodyslam_jax.solver.padding import pad
+from bodyslam_jax.solver.second_order import add_second_order, curvature_of
 from bodyslam_jax.solver.selected_inverse import selected_inverse
 from bodyslam_jax.solver.solve import check_start, method_of, run
 from bodyslam_jax.solver.step import little
 
 
 class Marginals(eqx.Module):
-    """Covariances of one group at a time, in the metric world frame."""
+    """Marginal covariances of each group, in the metric world frame."""
 
     scale: Float[Array, ""]
     """Variance of s, (m per unit)^2"""
     cameras: Float[Array, "t 3 3"]
-    """Of camera centres `s r'`, m^2"""
+    """Covariances of camera centres `s r'`, m^2"""
     people: Float[Array, "h t 3 3"]
-    """Of pelvis joints in the world, m^2"""
+    """Covariances of pelvis joints in the world, m^2"""
     intrinsics: Float[Array, "i i"]
-    """px^2; without a coordinate where none is free."""
+    """Covariance of the intrinsics, px^2; empty where none is free."""
     globals: Float[Array, "g g"]
-    """Of named globals; without a coordinate where none is free."""
+    """Covariance of named globals; empty where none is free."""
     shapes: Float[Array, "h 10 10"]
+    """Covariances of SMPL β, in standard deviations of the population."""
     landmarks: Float[Array, "l 3 3"]
-    """Of `s l'`, m^2"""
+    """Covariances of landmarks `s l'`, m^2"""
 
 
 def marginals(problem: Problem, state: State) -> Marginals:
-    """Marginal covariances at a solution: the inverse of `J^T J` and of what keypoints
-    bend (`_curvature`); of `J^T J` alone where the two have none, as away from a
-    minimum.
+    """Returns the marginal covariances at a solution: blocks of the inverse of `J^T J`
+    and the second-order term of keypoints (`second_order.py`), or of `J^T J` alone
+    where the sum is not positive definite, as away from a minimum.
 
-    They count for as much as the weights do: sigmas that are standard deviations, and
-    correlated errors modelled as such. The equations are set up by the program that
-    `solve` has compiled, in a schedule without steps. Differentiable by problem and
-    state, backwards (`_spread_gradient`).
+    They are as good as the weights: sigmas must be standard deviations, and correlated
+    errors modelled as such. The equations are set up by the program that `solve` has
+    compiled, in a schedule without steps. Differentiable in reverse mode with respect
+    to problem and state (`_equations`).
 
     **Raises:** `ValueError` if `state` does not fit the problem, as `solve` does.
     """
@@ -104,7 +117,7 @@ def _pulled(given: tuple[Problem, State], cotangent: Marginals):
     def spread(arrays):
         problem, state = eqx.combine(arrays, static)
         problem = dataclasses.replace(problem, layout=problem.layout.all_used())
-        return _marginals(problem, state, equations(problem, state))
+        return _marginals(problem, state, _equations(problem, state))
 
     found, pull = jax.vjp(spread, arrays)
     full = jax.tree.map(
@@ -117,11 +130,43 @@ def _pulled(given: tuple[Problem, State], cotangent: Marginals):
 
 
 @in_full_precision
+def _equations(problem: Problem, state: State) -> Final:
+    """Returns the equations of the loop's last factorisation, of a padded problem."""
+    problem = problem.with_prediction(problem.predict(state))
+    sizes = sizes_of(problem, state)
+    lin = linearise(problem, gather(problem), state, sizes.dtype)
+    lin = _bent(problem, lin, state, sizes)
+    return final_of(lin, eliminate(problem, lin, sizes, _damping(lin, sizes)))
+
+
+def _damping(lin: Linearisation, sizes: Sizes) -> dict:
+    return damped(
+        diagonals(lin, sizes),
+        jnp.asarray(little(sizes.dtype), sizes.dtype),
+        UNOBSERVED_DIAGONAL,
+    )
+
+
+def _bent(
+    problem: Problem, lin: Linearisation, state: State, sizes: Sizes
+) -> Linearisation:
+    """Adds the second-order term of keypoints where the sum is positive definite."""
+    bent = add_second_order(lin, curvature_of(problem, lin, state, sizes))
+    tried = jax.lax.stop_gradient(bent)
+    factor = eliminate(problem, tried, sizes, _damping(tried, sizes)).factor
+    sound = jnp.all(jnp.isfinite(factor.half))
+    # A masked sum, as the gradient of a choice between factorisations would be NaN.
+    mixed = lambda a, b: a + jnp.where(sound, b - a, 0.0).astype(a.dtype)
+    return jax.tree.map(
+        lambda a, b: mixed(a, b) if eqx.is_inexact_array(a) else a, lin, bent
+    )
+
+
+@in_full_precision
 def _marginals(problem: Problem, state: State, final: Final) -> Marginals:
     sizes = sizes_of(problem, state)
     lin = final.lin
-    least = jnp.asarray(little(state.scale.dtype), state.scale.dtype)
-    damping = damped(diagonals(lin, sizes), least, UNSEEN)
+    damping = _damping(lin, sizes)
     fronts, windows, arrow = selected_inverse(
         final.factor,
         final.roots,
@@ -161,7 +206,7 @@ def _free_globals(problem: Problem, sizes: Sizes) -> Array:
 
 
 def _centres(problem, state, sizes, fronts):
-    """Covariances of camera centres and pelvis joints, from each chunk's front."""
+    """Returns covariances of camera centres and pelvis joints, from the fronts."""
     h, n = sizes.people, sizes.chunks
     head = fronts.shape[-1] - sizes.globals - CAMERAS
     hb = head // h if h else 0
@@ -179,7 +224,7 @@ def _centres(problem, state, sizes, fronts):
     by_centre = s * eye * free_camera[..., None, 3:]
 
     def spread(jacobian, index):
-        """`J Σ J^T` of each frame, with the columns of J at `index` of the front."""
+        """Returns `J Σ J^T` of each frame; J's columns are at `index` of the front."""
         part = fronts[:, index[:, :, None], index[:, None, :]]
         return jnp.einsum("nbij,nbjk,nblk->nbil", jacobian, part, jacobian)
 
@@ -210,13 +255,13 @@ def _centres(problem, state, sizes, fronts):
 
 
 def _turned(C, r):
-    """`d (C Exp(ω) r) / dω = -C [r]x`"""
+    """Returns `d (C Exp(ω) r) / dω = -C [r]x`."""
     r = jnp.broadcast_to(r[..., None, :], C.shape)
     return jnp.cross(r, C)
 
 
 def _landmarks(problem, state, sizes, lin: Linearisation, damping, windows, arrow):
-    """Of landmarks in metres: their own, and the share of the scale."""
+    """Returns covariances of landmarks, m^2, with the share of the scale."""
     out = jnp.zeros((len(state.landmarks), 3, 3), state.scale.dtype)
     free_s = problem.free.scale if "scale" in sizes.variables else 0.0
     s = state.scale
@@ -241,8 +286,8 @@ def _landmarks(problem, state, sizes, lin: Linearisation, damping, windows, arro
 
 
 def _from_cameras(bucket, table, damp, windows, sizes):
-    """`V^-1 + V^-1 W^T Σ W V^-1` of each landmark that went before the cameras, and its
-    covariance with the scale; and the scale's."""
+    """Returns `V^-1 + V^-1 W^T Σ W V^-1` of each landmark that was eliminated before
+    the cameras, its covariance with the scale, and the variance of the scale."""
     rows = half_inverse(table, damp)
     zero = jnp.zeros_like(rows[0][0])
     half = jnp.stack(
@@ -257,7 +302,7 @@ def _from_cameras(bucket, table, damp, windows, sizes):
         chunk, cross, side, inverse = group
         known = windows[chunk][index[:, None], index[None, :]]
         count = cross.shape[-1]
-        # Neither the scale nor named globals move a landmark: rows of zeros for them.
+        # Landmarks do not couple with the scale or named globals: rows of zeros.
         still = lambda rows: jnp.zeros((rows, 3, count), cross.dtype)
         w = jnp.concatenate(
             [cross.reshape(width, 3, count), still(1), side, still(sizes.named)]

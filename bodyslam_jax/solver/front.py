@@ -1,4 +1,4 @@
-"""What the frames of one chunk of a person touch, in groups, and blocks between groups.
+"""Groups of variables that one chunk of a person touches, and blocks between them.
 
     before       last posture of the chunk before
     old_roots    its last roots, as many as terms reach back
@@ -9,7 +9,7 @@
     cameras      all its cameras
     common       scale, intrinsics and shape of the person; and the right-hand side
 
-`inner` is eliminated with the chunk; what is left couples the rest of two chunks.
+`inner` is eliminated with the chunk; its Schur complement couples two chunks.
 """
 
 import equinox as eqx
@@ -19,8 +19,16 @@ from jaxtyping import Array, Float
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver.blocks import Linearisation, Sizes
 
-KEPT = ("before", "old_roots", "old_cameras", "sep", "roots", "cameras", "common")
-"""The groups that stay, in this order."""
+KEPT_GROUPS = (
+    "before",
+    "old_roots",
+    "old_cameras",
+    "sep",
+    "roots",
+    "cameras",
+    "common",
+)
+"""The groups that are not eliminated with the chunk, in this order."""
 
 Pairs = dict[tuple[str, str], Array]
 """Blocks between groups, rows by columns; each pair once, absent where 0."""
@@ -30,11 +38,11 @@ class Window(eqx.Module):
     """Static sizes of the groups."""
 
     pose: int = eqx.field(static=True)
-    """Coordinates of a posture; none where postures are not among the variables."""
+    """Number of coordinates of a posture; 0 where postures are not variables."""
     cross: bool = eqx.field(static=True)
     """Whether postures couple with cameras, or with roots of other frames."""
     reach: int = eqx.field(static=True)
-    """Frames back that terms of roots and cameras reach."""
+    """Number of frames that factors of roots and cameras reach back."""
     own_globals: int = eqx.field(static=True)
 
     @property
@@ -53,11 +61,11 @@ class Window(eqx.Module):
 
     @property
     def person(self) -> int:
-        """What a person keeps of a chunk: its last posture and roots."""
+        """Number of coordinates of a person's last posture and last roots."""
         return self.pose + 6 * self.reach
 
     def slices(self, names: tuple[str, ...]) -> dict[str, slice]:
-        """Where groups stand, one after another."""
+        """Returns the slices of groups that stand one after another."""
         found, start = {}, 0
         for name in names:
             found[name] = slice(start, start + self.widths[name])
@@ -66,7 +74,7 @@ class Window(eqx.Module):
 
 
 def window_of(lin: Linearisation, sizes: Sizes) -> Window:
-    """The window that holds every block of a linearisation.
+    """Returns the window that holds every block of a linearisation.
 
     **Raises:** `ValueError` if a factor couples frames that lie too far apart.
     """
@@ -90,7 +98,7 @@ def window_of(lin: Linearisation, sizes: Sizes) -> Window:
 
 
 def _block(pairs: Pairs, row: str, column: str) -> Array | None:
-    """The block between two groups, either way round; `None` where it is 0."""
+    """Returns the block between two groups, either way round; `None` where it is 0."""
     if (row, column) in pairs:
         return pairs[row, column]
     other = pairs.get((column, row))
@@ -100,7 +108,7 @@ def _block(pairs: Pairs, row: str, column: str) -> Array | None:
 def matrix_of(
     window: Window, pairs: Pairs, rows: tuple[str, ...], columns: tuple[str, ...]
 ) -> Float[Array, "*b _ _"]:
-    """Blocks side by side and one below another."""
+    """Returns the matrix of blocks between groups of rows and groups of columns."""
     like = next(iter(pairs.values()))
     zeros = lambda p, q: jnp.zeros((*like.shape[:-2], p, q), like.dtype)
     widths = window.widths
@@ -116,7 +124,7 @@ def matrix_of(
 
 
 def add_pairs(first: Pairs, second: Pairs) -> Pairs:
-    """The sum of two, whichever way round their blocks are held."""
+    """Returns the sum of both, whichever way round their blocks are held."""
     total = dict(first)
     for (row, column), block in second.items():
         if (row, column) in total:
@@ -131,10 +139,10 @@ def add_pairs(first: Pairs, second: Pairs) -> Pairs:
 def spread(
     block: Float[Array, "*n B p q"], row: int, column: int, reach: int
 ) -> Float[Array, "*n _ _"]:
-    """Blocks of each frame of a chunk between what stands `row` and `column` frames
-    before it, among the chunk's frames and the `reach` before it.
+    """Places the block of each frame k of a chunk at frames k - `row` and k - `column`
+    of the matrix over the chunk's frames and the `reach` before it.
 
-    Products with shifted identities: scatters of small blocks are slow.
+    It multiplies with shifted identities, as scatters of small blocks are slow.
     """
     n = block.ndim - 3
     length = CHUNK + reach

@@ -1,8 +1,7 @@
-"""GMRES that applies its operator in one place, and knows whether it converged.
+"""GMRES that traces its operator once, and reports failure to converge.
 
-JAX' own does neither: an operator as large as ours stands in its program seven times,
-which then takes as much longer to compile, and nobody learns what is left. Saad and
-Schultz, GMRES (1986).
+JAX's own does neither: it traces the operator seven times, which takes as much longer
+to compile, and returns no residual. Saad and Schultz, GMRES (1986).
 """
 
 from collections.abc import Callable
@@ -13,27 +12,30 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int
 
-RESTART = 100
-"""Directions at most: outliers bend the cost in as many as there are, and each must
-have been seen. With 20 at a time a path of 120 frames did not converge."""
-CYCLES = 2
-CLOSE = 1e-3
-"""Share of the solution by which it may be wrong; in most cases it is far less."""
+MAX_DIRECTIONS = 100
+"""Maximum number of directions in a cycle. Every outlier changes the curvature in
+another direction, and each has to be among them: with 20 at a time a path of 120 frames
+did not converge."""
+MAX_CYCLES = 2
+"""Maximum number of cycles of `MAX_DIRECTIONS`."""
+MAX_RELATIVE_ERROR = 1e-3
+"""Share of the first residual below which a solution counts as found; in most cases it
+is far smaller."""
 
 
 class _Search(eqx.Module):
-    """Between two passes: one for what is left of `b`, then one for each direction."""
+    """State between two passes: one for the residual, then one for each direction."""
 
     x: Float[Array, " n"]
     basis: Float[Array, "k n"]
     table: Float[Array, "k j"]
-    """What the operator makes of one direction, in terms of all."""
+    """Hessenberg matrix: the operator's image of each direction, in terms of all."""
     length: Float[Array, ""]
-    """Of what was left when the cycle began."""
+    """Length of the residual when the cycle began."""
     whole: Float[Array, ""]
-    """The same at the very first."""
+    """Length of the residual when the first cycle began."""
     known: Int[Array, ""]
-    """Directions in this cycle."""
+    """Number of directions in this cycle."""
     cycle: Int[Array, ""]
     ended: Bool[Array, ""]
 
@@ -41,19 +43,20 @@ class _Search(eqx.Module):
 def gmres(
     left_of: Callable[[Array, Array], Array], like: Float[Array, " n"], rtol: float
 ) -> Float[Array, " n"]:
-    """The `x` of `A x = b`, or NaN if it was not found.
+    """Returns the `x` of `A x = b`, or NaN if it was not found.
 
-    `left_of(x, share)` is `M (share b - A x)`, where `M` is about the inverse of `A`:
-    what is left is then about the error of `x`, of which all numbers should be of one
-    unit. It ends where that is `rtol` of the whole, or does not halve in a cycle any
-    more, as where rounding shows; within `CLOSE` of the whole counts as found.
+    `left_of(x, share)` is `M (share b - A x)`, where the preconditioner `M` is about
+    the inverse of `A`: the residual is then about the error of `x`, whose coordinates
+    should be of one unit. The iteration ends where the residual is `rtol` of the first
+    one, or does not halve in a cycle, as at the level of rounding; `x` counts as found
+    below `MAX_RELATIVE_ERROR` of the first one.
     """
     zero = jnp.zeros_like(like, shape=())
-    # Of a direction that is not known yet: a row of its own, so that it has no share.
-    none = jnp.eye(RESTART + 1, RESTART, -1, dtype=like.dtype)
+    # Columns of unknown directions are unit vectors, so that their coefficients are 0.
+    none = jnp.eye(MAX_DIRECTIONS + 1, MAX_DIRECTIONS, -1, dtype=like.dtype)
     start = _Search(
         x=jnp.zeros_like(like),
-        basis=jnp.zeros_like(like, shape=(RESTART + 1, like.size)),
+        basis=jnp.zeros_like(like, shape=(MAX_DIRECTIONS + 1, like.size)),
         table=none,
         length=zero,
         whole=zero,
@@ -69,7 +72,7 @@ def gmres(
         given = jnp.where(first, s.x, s.basis[at])
         image = left_of(given, share) * (2 * share - 1)
         basis = jnp.where(first, 0.0, s.basis)
-        # Once leaves too much of the other directions, twice does not.
+        # Orthogonalised twice: once leaves too much of the other directions.
         parts = basis @ image
         image = image - parts @ basis
         more = basis @ image
@@ -84,9 +87,9 @@ def gmres(
         q, r = jnp.linalg.qr(table)
         shares = jsp.linalg.solve_triangular(r, target @ q)
         left = jnp.linalg.norm(table @ shares - target)
-        full = ~first & ((s.known == RESTART) | ~(left > rtol * whole))
+        full = ~first & ((s.known == MAX_DIRECTIONS) | ~(left > rtol * whole))
         stalls = (s.cycle > 0) & ~(size < 0.5 * s.length)
-        over = ~(size > rtol * whole) | stalls | (s.cycle == CYCLES)
+        over = ~(size > rtol * whole) | stalls | (s.cycle == MAX_CYCLES)
         return _Search(
             x=jnp.where(full, s.x + shares @ basis[:-1], s.x),
             basis=basis.at[s.known].set(unit),
@@ -99,4 +102,4 @@ def gmres(
         )
 
     found = jax.lax.while_loop(lambda s: ~s.ended, one, start)
-    return jnp.where(found.length <= CLOSE * found.whole, found.x, jnp.nan)
+    return jnp.where(found.length <= MAX_RELATIVE_ERROR * found.whole, found.x, jnp.nan)

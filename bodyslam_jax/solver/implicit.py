@@ -22,10 +22,15 @@ from jaxtyping import Array
 from bodyslam_jax.graph import LandmarkPrior, Problem, Reprojection, State, Step
 from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver.batching import sequential_vmap
-from bodyslam_jax.solver.blocks import mask_of, sizes_of
+from bodyslam_jax.solver.blocks import (
+    Linearisation,
+    Sizes,
+    globals_of,
+    mask_of,
+    sizes_of,
+)
 from bodyslam_jax.solver.compilation import compiled, in_full_precision
 from bodyslam_jax.solver.gmres import gmres
-from bodyslam_jax.solver.gradient import with_gradient
 from bodyslam_jax.solver.linear_system import (
     Move,
     damped,
@@ -37,14 +42,14 @@ from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.posture import from_turns, to_turns
 
-_LITTLE = {"float64": 1e-9, "float32": 1e-5}
-"""Damping of the preconditioner."""
+_PRECONDITIONER_DAMPING = {"float64": 1e-9, "float32": 1e-5}
+"""Marquardt's damping of the preconditioner, by precision."""
 _RTOL = {"float64": 1e-10, "float32": 1e-5}
-"""Share of the adjoint at which GMRES ends."""
+"""Relative residual at which GMRES ends, by precision."""
 
 
 def cotangent_of_problem(problem: Problem, state: State, cotangent: State) -> Problem:
-    """What a cotangent on the solution is on everything in the (padded) problem."""
+    """Pulls a cotangent on the solution back to all arrays of the (padded) problem."""
     given = problem, state, cotangent
     if is_traced(given):
         return sequential_vmap(_program(False), _program(True))(*given)
@@ -67,8 +72,8 @@ def _cotangent_of_problem(problem, state, cotangent):
     if problem.basis is not None:
         masks["poses"] = jnp.ones_like(diagonal["poses"])
     mask = jax.tree.map(lambda m, d: jnp.where(d > 0, m, 0.0), masks, diagonal)
-    # Standard deviations: in metres and radians, points that nobody sees well would
-    # decide alone when the rest is good enough.
+    # In units of standard deviations: in metres and radians, poorly observed points
+    # would dominate the residual of GMRES.
     unit = jax.tree.map(lambda d: jax.lax.rsqrt(jnp.where(d > 0, d, 1.0)), diagonal)
     masked = lambda x: jax.tree.map(lambda m, s: m * s, mask, x)
     _, pull = jax.vjp(state.retract, zero)
@@ -82,8 +87,8 @@ def _cotangent_of_problem(problem, state, cotangent):
         seen = whole.predict(moved, frozen=False)
         fixed = whole.with_prediction(seen)
 
-        # About the place moved to, as the solver holds single coordinates: in the
-        # chart of another place they are others, and what pulls at them is not 0.
+        # In the chart at the moved state, where the solver holds single coordinates: in
+        # the chart at another state they are others, and their gradient is not 0.
         def cost(d):
             return fixed.cost(moved.retract(d), held=True)
 
@@ -97,7 +102,7 @@ def _cotangent_of_problem(problem, state, cotangent):
     def left_of(scaled, share):
         x = unravel(scaled * scale)
         product, _ = transpose(step_of(problem, masked(x)))
-        # A held coordinate is its own equation.
+        # The equation of a held coordinate is the identity.
         image = jax.tree.map(
             lambda b, m, p, x: share * b - jnp.where(m > 0, m * p, x),
             *(right, mask, coordinates_of(problem, product), x),
@@ -114,7 +119,7 @@ def _without_single_views(problem: Problem) -> Problem:
     """Drops observations of landmarks seen once: they say nothing about the rest, and
     leave the landmark's depth, and so the linear system, without a solution.
 
-    Not of landmarks that are held, or known besides: these tell where cameras are.
+    Those of landmarks that are held, or have a prior, stay: they locate the cameras.
     """
     factors = list(problem.factors)
     alone = jnp.all(mask_of(problem).landmarks > 0, axis=-1)
@@ -133,22 +138,22 @@ def _without_single_views(problem: Problem) -> Problem:
 
 
 Coordinates = dict[str, Array]
-"""What a step has, by name; postures in the coordinates that the solver moves
+"""Arrays of a step by name, with postures in the coordinates that the solver moves
 (`posture.py`)."""
 
 
 def coordinates_of(problem: Problem, slope: Step) -> Coordinates:
-    """A gradient by coordinates from one by steps."""
+    """Converts a gradient with respect to a step into one by coordinates."""
     return {**vars(slope), "poses": from_turns(problem, slope.poses)}
 
 
 def step_of(problem: Problem, x: Coordinates) -> Step:
-    """The step that has these coordinates."""
+    """Returns the step that has these coordinates."""
     return Step(**{**x, "poses": to_turns(problem, x["poses"])})
 
 
 def diagonal_of(problem: Problem, state: State) -> Coordinates:
-    """The diagonal of `J^T J`: 0 for coordinates that no measurement sees."""
+    """Returns the diagonal of `J^T J`: 0 for coordinates that no measurement sees."""
     problem = problem.refresh(state)
     sizes = sizes_of(problem, state)
     diagonal = diagonals(linearise(problem, gather(problem), state), sizes)
@@ -176,19 +181,58 @@ def diagonal_of(problem: Problem, state: State) -> Coordinates:
 def normal_solver(
     problem: Problem, state: State
 ) -> Callable[[Coordinates], Coordinates]:
-    """`v -> (J^T J)^-1 v`, hardly damped, by the solver's own elimination."""
+    """Returns `v -> (J^T J)^-1 v`, barely damped, by the solver's own elimination."""
     problem = problem.refresh(state)
     sizes = sizes_of(problem, state)
     lin = linearise(problem, gather(problem), state)
-    little = jnp.asarray(_LITTLE[state.scale.dtype.name], state.scale.dtype)
+    little = jnp.asarray(
+        _PRECONDITIONER_DAMPING[state.scale.dtype.name], state.scale.dtype
+    )
     damping = damped(diagonals(lin, sizes), little)
 
     def apply(right: Coordinates) -> Coordinates:
         down = jax.tree.map(jnp.negative, right)
         move = Move(step_of(problem, down), down["poses"])
-        there = with_gradient(problem, lin, sizes, move)
+        there = _with_gradient(problem, lin, sizes, move)
         eliminated = eliminate(problem, there, sizes, damping)
         found = solve_step(problem, state, there, sizes, eliminated)
         return {**vars(found.step), "poses": found.postures}
 
     return apply
+
+
+def _with_gradient(
+    problem: Problem, lin: Linearisation, sizes: Sizes, move: Move
+) -> Linearisation:
+    """Returns the same blocks of `J^T J` with the gradient `move`.
+
+    The implicit derivative solves the normal equations for such right-hand sides.
+    """
+    step, gradient = move.step, {}
+    for name, known in lin.gradient.items():
+        if name == "pose":
+            gradient[name] = move.postures
+        elif name == "root":
+            gradient[name] = step.roots
+        else:
+            gradient[name] = jnp.zeros_like(known)
+    if "camera_alone" in gradient:
+        gradient["camera_alone"] = step.cameras
+    elif "camera" in gradient:
+        gradient["camera"] = gradient["camera"].at[0].set(step.cameras)
+    common = globals_of(step, sizes)
+    # Indices of padding are those of a row of zeros, so that a plain gather suffices.
+    tables = tuple(
+        eqx.tree_at(
+            lambda t: t.gradient,
+            table,
+            jnp.moveaxis(step.landmarks[bucket.landmark], 1, 2),
+        )
+        for bucket, table in zip(problem.layout.buckets, lin.landmarks, strict=True)
+    )
+    names = "gradient", "globals_gradient", "landmarks"
+    return eqx.tree_at(
+        lambda lin: [getattr(lin, name) for name in names],
+        lin,
+        [gradient, common, tables],
+    )

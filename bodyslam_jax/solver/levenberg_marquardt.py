@@ -1,14 +1,14 @@
 """Levenberg-Marquardt on the factor graph, in optimistix's loop.
 
 A stage begins at the best scale for its people (`best_scale`). Steps are damped, and
-accepted on the true robust cost (`_trial`). The linearisation is
-kept after a rejected step. The motion model's prediction is frozen within a step and
-made anew after each accepted one. Steps that gain
-little know what keypoints bend (`_curvature`). Landmarks that no step would bring back
-are triangulated anew (`_triangulation`).
+accepted on the true robust cost (`step.py`). The linearisation is kept after a rejected
+step. The motion model's prediction is frozen within a step and computed anew after each
+accepted one. Near convergence the Hessian includes the second-order term of the
+keypoint factors (`second_order.py`). Landmarks in flat regions of their cost are
+triangulated anew (`retriangulation.py`).
 
-The stages of a schedule are phases of one loop, and differ by a mask: what they do is
-compiled once, and so is what covariances need of the last linearisation.
+The stages of a schedule are phases of one loop that differ by a mask, so that they are
+compiled once, together with the factorisation that covariances need.
 """
 
 import dataclasses
@@ -23,7 +23,11 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.graph import VARIABLES, Problem, State, Step, residual_of, robustify
-from bodyslam_jax.solver.best_scale import WORTH, best_scale, is_quadratic
+from bodyslam_jax.solver.best_scale import (
+    MIN_SCALE_COST_DECREASE,
+    best_scale,
+    is_quadratic,
+)
 from bodyslam_jax.solver.blocks import Linearisation, sizes_of
 from bodyslam_jax.solver.linear_system import Eliminated, damped, diagonals, eliminate
 from bodyslam_jax.solver.linearise import linearise
@@ -34,12 +38,13 @@ from bodyslam_jax.solver.second_order import add_second_order, curvature_if, nex
 from bodyslam_jax.solver.step import Trial, attempt
 
 MAX_DAMPING = 1e12
-LOST = (10.0, 0.5)
-"""Decrease of the cost for which a landmark is triangulated anew, after the first step
-and later: the cost is a negative log-likelihood."""
-NEAR = 0.01
-"""Share of the cost: landmarks are looked at again after a step that gains no more, as
-cameras are about right then, and at the end."""
+"""Damping above which a stage ends without convergence."""
+MIN_RETRIANGULATION_DECREASES = (10.0, 0.5)
+"""Least decrease of the cost, a negative log-likelihood, for which a landmark is
+triangulated anew: after the first step, and later."""
+RETRIANGULATION_RTOL = 0.01
+"""Landmarks are triangulated again after a step with a smaller relative decrease of the
+cost, as cameras are about right by then, and at convergence."""
 
 
 class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
@@ -50,30 +55,30 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     """
 
     free: Float[Array, "s v"]
-    """1 for the groups among `VARIABLES` that a stage moves."""
+    """1 for the groups among `VARIABLES` that a stage moves, else 0."""
     limit: Int[Array, " s"]
-    """Steps at most; a stage with none is left out."""
+    """Maximum number of steps; a stage with none is left out."""
     rtol: Any
     """Shape (s,): a stage ends when an undisturbed step lowers the cost by less than
     this share."""
     atol: Any
-    """Shape (s,): or by less than this. Optimistix declares both as one number."""
+    """Shape (s,): or by less than this. Optimistix annotates both as scalars."""
     damping: Float[Array, ""]
-    """At the first step of a stage; 0 is Gauss-Newton, with step control left to
-    `GAIN`."""
+    """Damping of the first step of a stage; 0 is Gauss-Newton, with step control
+    left to `MIN_GAIN_RATIO`."""
     keep: Bool[Array, ""]
-    """Whether to factorise once more at the end, hardly damped, for covariances."""
+    """Whether to factorise once more at the end, barely damped, for covariances."""
     length: int = eqx.field(static=True)
-    """Of the history."""
+    """Number of rows of the history."""
     dtype: np.dtype = eqx.field(static=True)
-    """Of blocks and factors."""
+    """Precision of blocks and factors."""
     norm: Callable[..., Any] = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         dtype = y.scale.dtype
         s, n, k = len(self.limit), self.length, len(args.factors)
         observations = gather(args)
-        # Filled in by the first step: each part is compiled once.
+        # Empty until the first step, so that each part is compiled once.
         struct = eqx.filter_eval_shape(_first, args, observations, y, self.dtype)
         empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), struct)
         stage = self._after(jnp.array(-1))
@@ -105,7 +110,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
 
     def _after(self, stage: Int[Array, ""]) -> Int[Array, ""]:
-        """The next stage that takes steps; their number if there is none."""
+        """Returns the next stage with steps; the number of stages if none has any."""
         count = len(self.limit)
         index = jnp.arange(count)
         return jnp.min(jnp.where((index > stage) & (self.limit > 0), index, count))
@@ -143,9 +148,9 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         enough = jnp.maximum(self.rtol[at] * known, self.atol[at])
         done = _is_done(trial, known, enough)
         nth = state.searched
-        near = accept & ((nth == 0) | (known - before < NEAR * known))
+        near = accept & ((nth == 0) | (known - before < RETRIANGULATION_RTOL * known))
         look = trial.finite & (near & (nth < 2) | done & (nth < 3))
-        least = jnp.where(nth == 0, *LOST).astype(dtype)
+        least = jnp.where(nth == 0, *MIN_RETRIANGULATION_DECREASES).astype(dtype)
         new_y, terms = jax.lax.cond(
             look,
             lambda s, t: triangulate_anew(problem, s, t, least),
@@ -168,20 +173,21 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         result = optx.RESULTS.where(broken, optx.RESULTS.nonfinite, result)
         over = done | stuck | broken | spent
         following = jnp.where(over, self._after(at), state.stage)
-        # Away from a minimum the curvature may have no inverse: then without it.
+        # Away from a minimum the second-order term may leave the Hessian indefinite:
+        # then it is factorised without the term.
         sound = ~state.bent | jnp.isfinite(trial.predicted)
         share = next_share(state.share, accept, known - before, known)
         share = jnp.where(self.damping > 0, share, 0.0)  # Gauss-Newton knows none
         i, old = state.steps[at], state.history
         put = lambda rows, i, value: rows.at[row, i].set(value, mode="drop")
-        # Where the last stage ended, the motion is predicted anew.
+        # The final cost is that with the motion predicted at the final state.
         ended = jnp.max(jnp.where(state.steps > 0, jnp.arange(len(steps)), -1))
         ended = jnp.where(last & (ended >= 0), ended, len(steps))
         end = lambda rows, value: rows.at[ended, state.steps[ended]].set(
             value, mode="drop"
         )
         moved = ((self.free[:, VARIABLES.index("scale")] > 0) & (steps > 0)).any()
-        is_better = last & moved & (gained > WORTH)
+        is_better = last & moved & (gained > MIN_SCALE_COST_DECREASE)
         history = History(
             end(put(put(old.cost, i, known), i + 1, cost), known),
             end(put(put(old.terms, i, lin.costs), i + 1, terms), lin.costs),
@@ -227,7 +233,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
 
 
 def _held(problem: Problem, free: Float[Array, " v"]) -> Problem:
-    """The problem with whole groups held besides those that are."""
+    """Returns the problem with the groups whose `free` is 0 held as well."""
     parts = {n: free[i] * getattr(problem.free, n) for i, n in enumerate(VARIABLES)}
     return eqx.tree_at(lambda p: p.free, problem, Step(**parts))
 
@@ -235,8 +241,8 @@ def _held(problem: Problem, free: Float[Array, " v"]) -> Problem:
 def _is_done(
     trial: Trial, known: Float[Array, ""], enough: Float[Array, ""]
 ) -> Bool[Array, ""]:
-    """Whether a step would gain less than is worth another one."""
-    # Below the rounding of the cost, or of residuals near 0, no decrease is seen.
+    """Returns True if a step would lower the cost by less than the tolerance."""
+    # Decreases below the rounding of the cost, or of residuals near 0, are invisible.
     eps = float(jnp.finfo(known.dtype).eps)
     floor = 8 * eps * known + eps**1.25
     small = trial.predicted <= jnp.maximum(enough, floor)
@@ -245,7 +251,7 @@ def _is_done(
 
 
 def _attempt_if(needed: Bool[Array, ""], *given: Any) -> Trial:
-    """`attempt`, or no step where only the cost is asked for."""
+    """Returns `attempt`, or no step where only the cost is needed."""
     problem, state, lin, *_ = given
     some = lambda _: attempt(*given)
     like = eqx.filter_eval_shape(some, None)
@@ -263,15 +269,18 @@ def _first(problem, observations, state, dtype):
 
 
 def final_of(lin: Linearisation, eliminated: Eliminated) -> Final:
-    """What a solve leaves of a factorisation."""
+    """Returns the parts of a factorisation that a solve keeps."""
     people = eliminated.people
     return Final(lin, eliminated.factor, None if people is None else people.roots)
 
 
 def _linearise_anew(problem, observations, state, dtype, begins, ends):
-    """The equations with the motion predicted anew, and the state that they are at:
-    where a stage `begins`, that of the best scale; the best scale, where a stage begins
-    or all of them have come to their `ends`; and what it gained or would gain."""
+    """Predicts the motion anew and linearises there.
+
+    Returns the normal equations, the prediction, the state, the best scale and the
+    decrease of the cost that it brings. Where a stage `begins` the state takes the best
+    scale; where all stages have come to their `ends` it is only reported.
+    """
     seen = problem.predict(state)
     problem = problem.with_prediction(seen)
     best, gained = jax.lax.cond(
@@ -286,5 +295,5 @@ def _linearise_anew(problem, observations, state, dtype, begins, ends):
 
 
 def lifted(state: State, problem: Problem) -> list[Array]:
-    """Lifted residuals of all factors, as a stock solver sees them."""
+    """Returns the lifted residuals of all factors, as a stock solver sees them."""
     return [robustify(f.loss, residual_of(f, state)) for f in problem.factors]

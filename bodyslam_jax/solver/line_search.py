@@ -1,7 +1,7 @@
-"""How far to go along a step: trials on the true robust cost.
+"""Line search along a step, on the true robust cost.
 
-A trial leaves behind the landmarks that the step throws off, so that a few bad points
-do not hold up the step of all others.
+A trial rejects the updates of landmarks whose cost they would increase, so that a few
+bad points do not hold up the step of all others.
 """
 
 import equinox as eqx
@@ -14,12 +14,12 @@ from bodyslam_jax.solver.retriangulation import cost_by_landmark, tracks_of
 
 
 def search(problem, state, move, slope, predicted, terms):
-    """The full step, and the one that a parabola through its cost finds better.
+    """Evaluates the full step and the minimum of a parabola through its cost.
 
-    Robust losses bend more than `J^T J` knows: full steps then overshoot to and fro.
-    The second evaluation is a few per cent of an iteration. Returns the better state,
-    landmarks left behind, the share of the step, the terms there, and actual over
-    predicted decrease of the full step.
+    Robust losses have more curvature than `J^T J`, so that full steps overshoot to and
+    fro. The second evaluation costs a few per cent of an iteration. Returns the better
+    state, which landmarks rejected their update, the share of the step, the cost by
+    factor there, and actual over predicted decrease of the full step.
     """
     known = jnp.sum(terms)
 
@@ -36,9 +36,9 @@ def search(problem, state, move, slope, predicted, terms):
         rejected = jnp.where(better, off, rejected)
         full = jnp.where(jnp.isnan(full), cost, full)
         # cost(a) = known - slope a + bend a^2, through the full step
-        add_second_order = full - known + slope
-        vertex = slope / jnp.where(add_second_order > 0, 2 * add_second_order, 1.0)
-        vertex = jnp.where(add_second_order > 0, vertex, 2.0)
+        bend = full - known + slope
+        vertex = slope / jnp.where(bend > 0, 2 * bend, 1.0)
+        vertex = jnp.where(bend > 0, vertex, 2.0)
         share = jnp.clip(vertex, 0.1, 2.0)
         return (share, place, rejected, best, best_terms, full), None
 
@@ -54,18 +54,18 @@ def search(problem, state, move, slope, predicted, terms):
 def _settle(
     problem: Problem, state: State, moved: State
 ) -> tuple[State, Bool[Array, " l"], Float[Array, " k"]]:
-    """A trial in which landmarks that the step throws off stay behind; which they are;
-    and its costs.
+    """Returns the moved state without those updates of landmarks that increase their
+    cost, the mask of these landmarks, and the cost by factor.
 
     A point that few frames see, or that an outlier pulls, may be sent behind the
-    cameras; given the cameras its cost is its own, so that it need not hold up the
-    step of all others.
+    cameras. Given the cameras, landmarks are independent: rejecting one does not affect
+    the step of the others.
     """
     tracks = tracks_of(problem)
     keep = jnp.zeros(len(state.landmarks), bool)
     of_tracks = jnp.zeros_like(state.scale)
     if tracks is not None:
-        # One map over both: cameras are gathered once for all observations.
+        # One `vmap` over both, so that cameras are gathered once for all observations.
         both = jnp.stack([state.landmarks, moved.landmarks])
         at = lambda x: eqx.tree_at(lambda s: s.landmarks, moved, x)
         found = jax.vmap(lambda x: cost_by_landmark(problem, tracks, at(x)))(both)

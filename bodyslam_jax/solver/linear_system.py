@@ -40,7 +40,7 @@ from bodyslam_jax.solver.reduced_system import Chunks, add_marginal_prior, assem
 
 
 class Eliminated(eqx.Module):
-    """All that back-substitution needs."""
+    """The factorised equations, with all that back-substitution needs."""
 
     damping: dict
     window: Window
@@ -49,7 +49,7 @@ class Eliminated(eqx.Module):
 
 
 def diagonals(lin: Linearisation, sizes: Sizes) -> dict:
-    """The diagonal of `J^T J`, by group; landmarks in the order of the tables."""
+    """Returns the diagonal of `J^T J` by group; landmarks as in the tables."""
     dtype = lin.globals.dtype
     t = sizes.chunks * CAMERAS // 6
     diagonal = lambda x: jnp.diagonal(x, axis1=-2, axis2=-1).astype(dtype)
@@ -81,8 +81,8 @@ def diagonals(lin: Linearisation, sizes: Sizes) -> dict:
     return result
 
 
-UNSEEN = 1e-12
-"""Weight of a coordinate that no measurement sees, for covariances: next to nothing."""
+UNOBSERVED_DIAGONAL = 1e-12
+"""Diagonal entry of a coordinate that no measurement observes, for covariances."""
 
 
 def damped(
@@ -90,7 +90,7 @@ def damped(
     damping: Float[Array, ""],
     unseen: float | Float[Array, ""] = 1.0,
 ) -> dict:
-    """What Marquardt's damping adds to the diagonal; `unseen` where that is 0."""
+    """Returns the damping of each coordinate; `unseen` where its diagonal is 0."""
     tiny = jnp.finfo(damping.dtype).tiny ** 0.5
     add = lambda d: jnp.where(d > tiny, damping * d, unseen)
     return jax.tree.map(add, diagonal)
@@ -110,7 +110,11 @@ def eliminate(
 def reduce_to_chunks(
     problem: Problem, lin: Linearisation, sizes: Sizes, damping: dict
 ) -> tuple[Chunks, Window, People | None]:
-    """The system of chunks that landmarks, inner postures and inner roots leave."""
+    """Eliminates landmarks, inner postures and inner roots.
+
+    Returns the reduced system of chunks, the sizes of its groups, and what
+    back-substitution needs of people.
+    """
     reduced = eliminate_landmarks(problem, lin.landmarks, damping["landmarks"], sizes)
     window = window_of(lin, sizes)
     people = None
@@ -139,7 +143,7 @@ def solve_step(
     sizes: Sizes,
     eliminated: Eliminated,
 ) -> Move:
-    """The step that solves the factorised equations, in the state's own precision."""
+    """Solves the factorised equations for a step, in the state's own precision."""
     h, n = sizes.people, sizes.chunks
     lin, zero = cast((lin, state.zero_step()), sizes.dtype)
     steps, common = back_substitute(eliminated.factor, sizes)
@@ -184,7 +188,7 @@ def solve_step(
 def quadratic(
     problem: Problem, diagonal: dict, sizes: Sizes, move: Move
 ) -> Float[Array, ""]:
-    """`δ^T diag(H) δ`"""
+    """Returns `δ^T D δ` for a diagonal D."""
     step = move.step
     total = jnp.sum(diagonal["camera"] * step.cameras**2)
     total = total + jnp.sum(diagonal["root"] * step.roots**2)
@@ -198,7 +202,7 @@ def quadratic(
 
 
 def slope_along(problem: Problem, lin: Linearisation, sizes: Sizes, move: Move):
-    """`g^T δ`"""
+    """Returns `g^T δ`, the derivative of the cost along a step."""
     step = move.step
     total = jnp.sum(lin.globals_gradient * globals_of(step, sizes))
     gradient = lin.gradient

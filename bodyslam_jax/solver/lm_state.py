@@ -1,4 +1,4 @@
-"""What the solver carries from one iteration to the next, and what it leaves."""
+"""State, history and final equations of the solver's loop."""
 
 from typing import Any
 
@@ -12,15 +12,15 @@ from bodyslam_jax.solver.elimination.person import RootFactor
 
 
 class History(eqx.Module):
-    """One entry an iteration, of which the first `num_steps` are filled.
+    """One row an iteration, of which the first `num_steps` are filled.
 
-    Time is not among them: the loop is one compiled program (see `clock`).
+    Times are not recorded: the loop is one compiled program (see `clock`).
     """
 
     cost: Float[Array, "*s _"]
-    """Before each iteration, and after the last."""
+    """Cost before each iteration, and after the last."""
     terms: Float[Array, "*s _ k"]
-    """By factor, in the order of the problem."""
+    """Cost by factor, in the order of the problem."""
     damping: Float[Array, "*s n"]
     step: Float[Array, "*s n"]
     """Length of the step in standard deviations: `sqrt(δ^T diag(H) δ)`."""
@@ -28,31 +28,31 @@ class History(eqx.Module):
 
 
 class Final(eqx.Module):
-    """The normal equations where the solver stopped, hardly damped, factorised."""
+    """The factorised normal equations, barely damped, where the solver stopped."""
 
     lin: Linearisation
-    """Without what keypoints bend (`_curvature`), which the factor may have."""
+    """Without the second-order term of keypoints, which `factor` may include."""
     factor: Factor
     roots: RootFactor | None
-    """Of the people's roots that were eliminated within chunks."""
+    """Factor of the people's roots that were eliminated within chunks."""
 
 
 class Loop(eqx.Module):
     """The state of `StructuredLevenbergMarquardt` between two iterations."""
 
     stage: Int[Array, ""]
-    """That runs now; the number of stages in the last rounds, which tell the cost, and
-    factorise for covariances."""
+    """Stage that runs now; the number of stages in the last rounds, which evaluate the
+    cost and factorise for covariances."""
     prediction: Any
     observations: Observations | None
     final: Final
     stale: Bool[Array, ""]
-    """Whether `final.lin` is of an earlier state or stage."""
+    """Whether `final.lin` belongs to an earlier state or stage."""
     damping: Float[Array, ""]
     landmark_damping: Float[Array, " l"]
-    """Damping that landmarks have at least, each by itself."""
+    """Least damping of each landmark, as a share of its own diagonal."""
     searched: Int[Array, ""]
-    """How often landmarks were triangulated anew in this stage."""
+    """Number of retriangulations of landmarks in this stage."""
     nu: Float[Array, ""]
     cost: Float[Array, ""]
     first_cost: Float[Array, ""]
@@ -60,9 +60,9 @@ class Loop(eqx.Module):
     """Another s with a lower cost where the solve ended; NaN if none is known."""
     steps: Int[Array, " s"]
     share: Float[Array, ""]
-    """Of what keypoints bend (`_curvature`), in the next step."""
+    """Share of the second-order term of keypoints in the next step."""
     bent: Bool[Array, ""]
-    """Whether the last factorisation is to have all of that."""
+    """Whether the last factorisation includes all of the second-order term."""
     finished: Bool[Array, ""]
     result: optx.RESULTS
     history: History

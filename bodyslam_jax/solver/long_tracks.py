@@ -1,9 +1,9 @@
 """Landmarks that are eliminated last, with the globals.
 
-A few that last much longer than all others would widen the band of cameras for all
-(`graph/long_tracks.py`). Their blocks go into the arrow as they are. They are one
-bucket; their coordinates stand group by group, as in its tables: x of all, then y, then
-z.
+A few landmarks that are seen much longer than all others would widen the band of
+cameras for all (`graph/long_tracks.py`). Their blocks become part of the arrow. They
+form one bucket; their coordinates stand group by group, as in its tables: x of all,
+then y, then z.
 """
 
 import equinox as eqx
@@ -16,13 +16,13 @@ from bodyslam_jax.solver.blocks import CAMERAS, LandmarkBlocks, Sizes
 
 
 class Lasting(eqx.Module):
-    """The arrow's part of `k` coordinates."""
+    """Blocks of the `k` coordinates of lasting landmarks in the arrow."""
 
     cameras: Float[Array, "n c k"]
-    """Of each chunk, as they stand."""
+    """Coupling with the cameras of each chunk, as they stand."""
     intrinsics: Float[Array, "i k"]
     own: Float[Array, "k k"]
-    """Damped."""
+    """Their own block, damped."""
     rhs: Float[Array, " k"]
 
 
@@ -32,7 +32,7 @@ def lasting_blocks(
     damping: tuple[Array, ...],
     sizes: Sizes,
 ) -> Lasting | None:
-    """What the table of lasting landmarks holds; `None` where there are none."""
+    """Returns the blocks of lasting landmarks; `None` where there are none."""
     for bucket, table, damp in zip(
         problem.layout.buckets, tables, damping, strict=True
     ):
@@ -61,7 +61,7 @@ def lasting_blocks(
 def move_lasting(
     problem: Problem, steps: Float[Array, " k"], out: Float[Array, "l 3"]
 ) -> Float[Array, "l 3"]:
-    """Their steps, into those of all landmarks."""
+    """Returns `out`, the steps of all landmarks, with those of lasting ones set."""
     for bucket in problem.layout.buckets:
         if bucket.lasting:
             n, g = bucket.landmark.shape
@@ -73,8 +73,8 @@ def move_lasting(
 def lasting_spread(
     shape: tuple[int, int], sizes: Sizes, arrow: Float[Array, "a a"]
 ) -> tuple[Float[Array, "n g 3 3"], Float[Array, "n g 3"], Float[Array, " n"]]:
-    """Covariance of each of the bucket's landmarks, and with the scale; and the
-    scale's; from that of the arrow."""
+    """Extracts from the covariance of the arrow that of each of the bucket's landmarks,
+    its covariance with the scale, and the variance of the scale."""
     n, g = shape
     start = sizes.globals
     each = jnp.arange(n * g).reshape(n, g)

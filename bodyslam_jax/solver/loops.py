@@ -1,7 +1,7 @@
-"""Loops over the rows in use of tables that have room for more, and rows of tables.
+"""Loops over the used rows of padded tables, and access to single rows.
 
-`jax.lax.dynamic_index_in_dim` makes a function of the program for each shape, and
-allows for negative indices, which are not used here.
+`jax.lax.dynamic_index_in_dim` adds a function to the program for each shape, and
+handles negative indices, which are not used here.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ Index = int | Int[Array, ""]
 
 
 def row_of(x: Array, k: Index, axis: int = 0) -> Array:
-    """Row `k`, from 0, of an axis, which goes."""
+    """Returns row `k`, from 0, of an axis, which is dropped."""
     sizes = [1 if a == axis else n for a, n in enumerate(x.shape)]
     row = jax.lax.dynamic_slice(
         x, _start(x, k, axis), sizes, allow_negative_indices=False
@@ -24,7 +24,7 @@ def row_of(x: Array, k: Index, axis: int = 0) -> Array:
 
 
 def with_row(x: Array, row: Array, k: Index, axis: int = 0) -> Array:
-    """The same with row `k` of an axis replaced."""
+    """Returns `x` with row `k` of an axis replaced."""
     wide = jnp.expand_dims(row, axis)
     start = _start(x, k, axis)
     return jax.lax.dynamic_update_slice(x, wide, start, allow_negative_indices=False)
@@ -38,10 +38,10 @@ def _start(x, k, axis):
 def scan_used(
     step: Callable[..., Any], carry: Any, rows: Any, used: Int[Array, ""] | None
 ) -> tuple[Any, Any]:
-    """`jax.lax.scan` over the first `used` rows; results of the other rows are 0.
+    """Runs `jax.lax.scan` over the first `used` rows; results of the other rows are 0.
 
     The unused rows take no time. `None` is for all rows; only then is the loop
-    differentiable backwards.
+    differentiable in reverse mode.
     """
     if used is None:
         return jax.lax.scan(step, carry, rows)

@@ -1,4 +1,4 @@
-"""The first chunks of a problem as a prior on what is left of it.
+"""Marginalises the first chunks of a problem into a prior on the remaining ones.
 
 The measurements are split: `old` are those of the first frames and of all landmarks
 that these frames observe, `rest` are the others. With the normal equations `H δ = -g`
@@ -7,11 +7,12 @@ it depends on,
 
     Λ = H_RR - H_RE H_EE^-1 H_ER,    η = g_R - H_RE H_EE^-1 g_E.
 
-The elimination of a step (`linear_system.py`) has both when it has come to the last
-chunk of the first frames: landmarks, postures and roots are gone, chunks before it too,
-and what is not yet factorised is Λ, with the right-hand side -η. R are the last posture
-and the last roots of that chunk, its last cameras and those of the next chunks that
-observe old landmarks, and the globals. One elimination, whatever the size of R.
+The elimination of a step (`linear_system.py`) yields both when it has come to the last
+chunk of the first frames: landmarks, postures, roots and all chunks before it are
+eliminated, and the remaining system is Λ, with the right-hand side -η. R are the last
+posture and the last roots of that chunk, its last cameras and those of the next chunks
+that observe old landmarks, and the globals. It takes one elimination, whatever the size
+of R.
 
 With `Λ = W^T W` and `W^T b = η`, from the eigenvectors of Λ in units of its diagonal,
 `½ |W δ + b|²` is, up to a constant, the least cost of `old` over E: to second order,
@@ -61,42 +62,42 @@ from bodyslam_jax.solver.posture import basis_of
 from bodyslam_jax.solver.reduced_system import Chunks
 from bodyslam_jax.solver.solve import check_start
 
-_LITTLE = 64
-"""Damping of what is eliminated, in units of rounding: pivots of points without
-parallax stay positive, and what they add is below rounding."""
-_SAME = {"float64": 1e-6, "float32": 1e-2}
-"""Change of residuals, in standard deviations, that rounding may make where the map is
-moved as a whole."""
-_TURN = (0.3, -0.2, 0.4)
-"""rad. Any large one will do, and so will any shift and any ratio."""
-_SHIFT = (0.7, -0.4, 0.5)
-_RATIO = 1.3
+_ELIMINATION_DAMPING_EPS = 64
+"""Damping of eliminated variables, in units of the machine epsilon: pivots of points
+without parallax stay positive, and its effect on the rest is below rounding."""
+_INVARIANCE_TOLERANCE = {"float64": 1e-6, "float32": 1e-2}
+"""Largest change of an invariant residual, in standard deviations, that rounding may
+cause where the map is moved as a whole."""
+_TEST_ROTATION_RAD = (0.3, -0.2, 0.4)
+"""Rotation of the map, rad, by which invariance is tested; any large one will do, and
+so will any translation and any change of scale."""
+_TEST_TRANSLATION = (0.7, -0.4, 0.5)
+_TEST_SCALE = 1.3
 
 
 class Remainder(NamedTuple):
-    """What `marginalise` leaves."""
+    """The remaining problem and state after `marginalise`."""
 
     problem: Problem
     """The last of its factors is the `MarginalPrior`."""
     state: State
     landmarks: Int[np.ndarray, " l"]
-    """Which of the landmarks are left, as they were numbered."""
+    """Indices of the remaining landmarks in the original problem."""
 
 
 def marginalise(problem: Problem, state: State, frames: int) -> Remainder:
-    """The problem without the measurements of its first `frames` frames, which a prior
-    stands for.
+    """Returns the problem with the measurements of its first `frames`
+    frames replaced by a prior.
 
     `frames` is a multiple of `graph.CHUNK`, ten frames. The last ten of them stay, as
-    the past that later frames reach back to, and that a motion model looks back on:
-    their last cameras, roots and the last posture are in the prior, all else in them is
-    held. Landmarks that the first frames observe go with all their observations. The
-    prior is one more factor: it may be marginalised again, with the ten frames it is
-    of, and put into other problems whose first frames these are.
+    factors of later frames and the motion model reach back to them: their last cameras,
+    roots and the last posture are in the prior, all else in them is held. Landmarks
+    that the first frames observe are marginalised with all their observations. The
+    prior is one more factor: it may be marginalised again, together with its ten
+    frames, and added to other problems that begin with these frames.
 
-    Predictions of the motion model are those at `state`, and stay so in the prior.
-    Robust losses keep the weights that they have there, and derivatives are taken there
-    for good.
+    Predictions of the motion model, weights of robust losses and derivatives are those
+    at `state`, and stay fixed in the prior.
 
     Not for use within `jit`: how many coordinates stay depends on the tracks.
 
@@ -138,8 +139,8 @@ def marginalise(problem: Problem, state: State, frames: int) -> Remainder:
 def _observed_landmarks(
     problem: Problem, frames: int
 ) -> tuple[Bool[np.ndarray, " l"], int]:
-    """Landmarks with an observation in the first frames, and the number of frames up to
-    the last that what is marginalised depends on."""
+    """Returns which landmarks are observed in the first frames, and the number of
+    frames up to the last that the marginalised measurements depend on."""
     observed = np.zeros(len(problem.free.landmarks), bool)
     last = frames
     for factor in problem.factors:
@@ -155,7 +156,10 @@ def _observed_landmarks(
 
 
 def _reach(problem: Problem) -> int:
-    """Frames that factors reach back."""
+    """Returns the number of frames that factors reach back.
+
+    **Raises:** `ValueError` if that is a chunk or more.
+    """
     lags = [f.num_lags - 1 for f in problem.factors if isinstance(f, FrameFactor)]
     reach = max(lags, default=0)
     if reach >= CHUNK:
@@ -173,7 +177,8 @@ def _old(
     observed: Bool[np.ndarray, " l"],
     last: int,
 ) -> tuple[Problem, State]:
-    """The measurements that go, with the frames and landmarks that they depend on."""
+    """Returns the problem and state of the marginalised measurements, with the frames
+    and landmarks that they depend on."""
     present = np.arange(last) < frames
     chosen = [f for f in problem.factors if not _is_once(f)]
     factors = tuple(_part(f, 0, last, present, observed) for f in chosen)
@@ -205,7 +210,7 @@ def _rest(
     observed: Bool[np.ndarray, " l"],
     roots: int,
 ) -> Remainder:
-    """The measurements that stay, without the prior and the layout for it."""
+    """Returns the remaining problem, without the prior and the layout for it."""
     start, stop = frames - CHUNK, len(state.cameras)
     present = np.arange(start, stop) >= frames
     factors = tuple(
@@ -231,7 +236,7 @@ def _rest(
 
 
 def _from(start: int, shape: tuple[int, ...], axis: int) -> np.ndarray:
-    """1 from an index of an axis on, else 0; broadcasts to an array of this shape."""
+    """Returns 1 from an index of an axis on, else 0; broadcasts to this shape."""
     along = [n if a == axis else 1 for a, n in enumerate(shape)]
     return (np.arange(shape[axis]) >= start).astype(float).reshape(along)
 
@@ -241,7 +246,7 @@ def _is_once(factor: Factor) -> bool:
 
 
 def _cut(x: Any, start: int, stop: int, landmarks: Bool[np.ndarray, " l"]) -> Any:
-    """A state, or a mask, of some frames and landmarks."""
+    """Restricts a state, or a mask, to some frames and landmarks."""
     return dataclasses.replace(
         x,
         cameras=_rows(x.cameras, slice(start, stop)),
@@ -252,7 +257,7 @@ def _cut(x: Any, start: int, stop: int, landmarks: Bool[np.ndarray, " l"]) -> An
 
 
 def _rows(x: Array, at: Any) -> Array:
-    """`x[at]` by NumPy: JAX would compile a program for each shape."""
+    """Returns `x[at]` by NumPy: JAX would compile a program for each shape."""
     return jnp.asarray(np.asarray(x)[at])
 
 
@@ -263,7 +268,7 @@ def _part(
     present: Bool[np.ndarray, " t"],
     landmarks: Bool[np.ndarray, " l"],
 ) -> Factor:
-    """The measurements of some landmarks, or of the frames that are `present` among
+    """Restricts a factor to some landmarks, or to the frames that are `present` among
     those from `start` to `stop`."""
     if isinstance(factor, Reprojection):
         frame, landmark = np.asarray(factor.frame), np.asarray(factor.landmark)
@@ -286,7 +291,7 @@ def _part(
 
 
 def _frames(factor: FrameFactor, start: int, stop: int) -> FrameFactor:
-    """The factor of a sequence of these frames."""
+    """Returns the factor of the sequence from `start` to `stop`."""
     axis = 1 if factor.of_people else 0
     if isinstance(factor, Masked):
         inner = _frames(factor.factor, start, stop)
@@ -306,14 +311,13 @@ def _frames(factor: FrameFactor, start: int, stop: int) -> FrameFactor:
 
 
 def in_frames(factor: FrameFactor, present: Bool[np.ndarray, " t"]) -> FrameFactor:
-    """The factor with the residuals of these frames alone."""
+    """Returns the factor with the residuals of the `present` frames only."""
     kept = np.asarray(present)
     if isinstance(factor, Masked):
         both = np.asarray(factor.present) & kept
         return Masked(factor=factor.factor, present=jnp.asarray(both))
     if not factor.padding or factor.num_lags > 1:
-        # A row may weigh the residual of the row before it, whose measurement must
-        # therefore stay.
+        # A row may use the measurement of the row before it, which must therefore stay.
         values = getattr(factor, factor.time_fields[0])
         lead = values.shape[: 2 if factor.of_people else 1]
         return Masked(factor=factor, present=jnp.asarray(np.broadcast_to(kept, lead)))
@@ -327,12 +331,12 @@ def in_frames(factor: FrameFactor, present: Bool[np.ndarray, " t"]) -> FrameFact
     return factor
 
 
-# What elimination leaves.
+# The Schur complement.
 
 
 class _Trailing(eqx.Module):
-    """Λ and η of the last chunk of people that goes, of `count` chunks of cameras from
-    it on, and of globals."""
+    """Λ and η of people in the last marginalised chunk, of `count` chunks of cameras
+    from it on, and of globals."""
 
     matrix: Float[Array, "n n"]
     slope: Float[Array, " n"]
@@ -348,11 +352,12 @@ def _program() -> Callable[..., _Trailing]:
 def _trailing(
     problem: Problem, state: State, first: Int[Array, ""], count: int
 ) -> _Trailing:
-    """`first` is the number of chunks before the last one that goes."""
+    """Eliminates the `first` chunks before the last marginalised
+    one; returns Λ and η."""
     sizes = sizes_of(problem, state)
     lin = linearise(problem, gather(problem), state)
     dtype = state.scale.dtype
-    little = jnp.asarray(_LITTLE * jnp.finfo(dtype).eps, dtype)
+    little = jnp.asarray(_ELIMINATION_DAMPING_EPS * jnp.finfo(dtype).eps, dtype)
     damping = damped(diagonals(lin, sizes), little)
     chunks, window, _ = reduce_to_chunks(problem, lin, sizes, damping)
     layout = dataclasses.replace(problem.layout, used=first)
@@ -370,7 +375,7 @@ def _trailing(
             own.insert(0, rows(damping["pose"], 1, CHUNK - 1, 1)[:, 0])
         kept.insert(0, jnp.concatenate(own, axis=1).reshape(-1))
     added = jnp.concatenate([*kept, damping["globals"]])
-    # What stays is not damped.
+    # The damping of the remaining variables is removed.
     return _Trailing(
         matrix[:-1, :-1] - jnp.diag(added),
         -matrix[:-1, -1],
@@ -385,8 +390,9 @@ def _unfactorised(
     first: Int[Array, ""],
     count: int,
 ) -> Float[Array, "n n"]:
-    """What is left of people of chunk `first`, of cameras of `count` chunks, and of the
-    globals with the right-hand side, once the chunks before it are factorised."""
+    """Returns the Schur complement on people of chunk `first`, cameras of `count`
+    chunks, and the globals with the right-hand side, once the chunks before are
+    factorised."""
     _, r, q = chunks.coupling.shape
     head, tail = q - CAMERAS, sizes.arrow + 1
     after = (r - head - tail) // CAMERAS
@@ -400,7 +406,7 @@ def _unfactorised(
         pivot, coupling = (
             row_of(x, first + i) for x in (chunks.pivot, chunks.coupling)
         )
-        # Of people only those of the first: no old measurement sees the others.
+        # People of the first chunk only: no old measurement sees those of the others.
         mine = np.arange(q) if i == 0 else np.arange(head, q)
         place = np.arange(q) if i == 0 else cameras(i)
         later = np.arange(end - cameras(i)[-1] - 1)[: after * CAMERAS]
@@ -434,8 +440,8 @@ def _prior(
     invariant: Bool[np.ndarray, " 3"],
     postures: Float[np.ndarray, "h 69 p"],
 ) -> MarginalPrior:
-    """The factor of the remaining state that has this Λ and η; `postures` are turns by
-    the coordinates of the last postures."""
+    """Returns the factor of the remaining state that has this Λ and η; `postures` are
+    the derivatives of turns by the coordinates of the last postures."""
     frames = min(count * CHUNK, len(left.cameras))
     none = np.zeros(len(left.landmarks), bool)
     estimate = _cut(left, 0, frames, none)
@@ -455,7 +461,7 @@ def _prior(
     end = len(found.slope) - len(index.globals)
     kept = np.r_[: end - cut, end : len(found.slope)]
     rest = np.concatenate([index.cameras, index.globals])
-    # The prior is of turns: what the basis does not span of them it does not see.
+    # The prior is over turns, of which it sees only those that the basis spans.
     place = np.zeros((len(kept), size))
     width = found.window.person
     for h, turns in enumerate(postures):
@@ -482,11 +488,11 @@ def _prior(
 
 
 def _without(matrix, slope, gone, eps):
-    """Less some coordinates, which get rows of 0."""
+    """Returns Λ and η with the coordinates `gone` eliminated, whose rows become 0."""
     gone = gone[np.diag(matrix)[gone] > 0]
     unit = 1 / np.sqrt(np.diag(matrix)[gone])
     own = unit[:, None] * matrix[np.ix_(gone, gone)] * unit
-    own += _LITTLE * eps * np.eye(len(gone))
+    own += _ELIMINATION_DAMPING_EPS * eps * np.eye(len(gone))
     side = unit[:, None] * matrix[gone]
     gain = np.linalg.solve(own, side).T
     matrix = matrix - gain @ side
@@ -498,8 +504,8 @@ def _without(matrix, slope, gone, eps):
 def square_root(
     matrix: Float[np.ndarray, "n n"], slope: Float[np.ndarray, " n"], eps: float
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
-    """`W` with `W^T W` the matrix, and `b` with `W^T b` the slope, where the matrix is
-    not 0 to rounding."""
+    """Returns `W` with `W^T W` the matrix, and `b` with `W^T b` the slope, on the
+    eigenvectors whose eigenvalues are above rounding."""
     diagonal = np.maximum(np.diag(matrix), 0.0)
     unit = np.where(diagonal > 0, np.sqrt(diagonal), 1.0)
     values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
@@ -511,16 +517,17 @@ def square_root(
 
 
 def _invariant(problem: Problem, state: State) -> Bool[np.ndarray, " 3"]:
-    """Whether the measurements depend neither on where the map is, nor on how it is
-    turned, nor on its unit; held coordinates do not move with it."""
+    """Returns whether the measurements are invariant to translation, rotation and scale
+    of the map; held coordinates do not move with it."""
     change, size = (np.asarray(x) for x in _changes(problem, state))
-    free = change <= _SAME[state.scale.dtype.name] * (1 + size)
+    free = change <= _INVARIANCE_TOLERANCE[state.scale.dtype.name] * (1 + size)
     return free & free[0]
 
 
 @eqx.filter_jit
 def _changes(problem: Problem, state: State) -> tuple[Float[Array, " 3"], Array]:
-    """The largest change of a residual, and the largest residual."""
+    """Returns the largest change of a residual by each motion of the map, and
+    the largest residual."""
     mask = mask_of(problem)
 
     def residuals(moved: State) -> Array:
@@ -530,7 +537,10 @@ def _changes(problem: Problem, state: State) -> tuple[Float[Array, " 3"], Array]
         return jnp.concatenate(parts)
 
     dtype = state.scale.dtype
-    shift, turn = jnp.asarray(_SHIFT, dtype), so3.exp(jnp.asarray(_TURN, dtype))
+    shift, turn = (
+        jnp.asarray(_TEST_TRANSLATION, dtype),
+        so3.exp(jnp.asarray(_TEST_ROTATION_RAD, dtype)),
+    )
     centre = state.cameras[:, :3, 3]
 
     def placed(rotation, r):
@@ -541,7 +551,11 @@ def _changes(problem: Problem, state: State) -> tuple[Float[Array, " 3"], Array]
     ways = [
         (placed(C, centre + shift), state.landmarks + shift, state.scale),
         (placed(turn @ C, centre @ turn.T), state.landmarks @ turn.T, state.scale),
-        (placed(C, _RATIO * centre), _RATIO * state.landmarks, state.scale / _RATIO),
+        (
+            placed(C, _TEST_SCALE * centre),
+            _TEST_SCALE * state.landmarks,
+            state.scale / _TEST_SCALE,
+        ),
     ]
     before = residuals(state)
     change = []

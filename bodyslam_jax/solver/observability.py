@@ -1,4 +1,4 @@
-"""What the measurements do not determine, by name, and why where the scene shows it."""
+"""Names what the measurements do not determine, with the likely cause."""
 
 from collections.abc import Iterator
 
@@ -19,26 +19,26 @@ from bodyslam_jax.graph import (
 )
 from bodyslam_jax.solver.covariance import Marginals
 
-UNKNOWN = 1 / 3
-"""Standard deviation as a share of the thing itself from which it is not determined."""
-NEAR = 0.01
-"""A path this short beside the distance of what is seen shows no depth."""
-STRAIGHT = 3.0
-"""Degrees; a camera that turns less about its mean axis does not turn."""
-STILL = 0.1
-"""m; a person whose pelvis moves less in all stands still."""
-NO_BETTER = 0.7
-"""Share of a prior's standard deviation: what measurements lower less, they do not
-tell."""
+MAX_RELATIVE_DEVIATION = 1 / 3
+"""Relative standard deviation above which a quantity is not determined."""
+MIN_PATH_TO_DISTANCE = 0.01
+"""Least ratio of the camera path's extent to the landmarks' distance for depth."""
+MIN_ROTATION_DEG = 3.0
+"""Degrees about its mean axis; a camera that turns less does not turn."""
+MIN_TRAVEL_M = 0.1
+"""Extent in m below which a pelvis, or the camera, does not move."""
+MAX_POSTERIOR_TO_PRIOR = 0.7
+"""Standard deviation over the prior's, above which measurements do not determine a
+quantity."""
 
 
 def observability(problem: Problem, state: State, spread: Marginals) -> tuple[str, ...]:
-    """What the measurements do not determine, one line each; empty if all is well.
+    """Returns a line for each quantity that the measurements do not determine.
 
-    A direction counts as not determined where its standard deviation is more than a
-    third of the thing itself; focal length and size also where they are hardly better
-    known than before anything was measured. `state` is a solution and `spread` its
-    `marginals`; for the host, not for `jit`.
+    A quantity counts as not determined where its standard deviation is more than a
+    third of its value; focal length and body size also where it is hardly below that of
+    their priors. `state` is a solution and `spread` its `marginals`; for the host, not
+    for `jit`.
     """
     scene = _Scene(problem, state)
     parts = (_scale, _focal_length, _halves, _landmarks, _cameras, _people)
@@ -46,7 +46,7 @@ def observability(problem: Problem, state: State, spread: Marginals) -> tuple[st
 
 
 class _Scene:
-    """What is looked at, in metres."""
+    """Cameras, landmarks and people of a solution, in metres."""
 
     def __init__(self, problem: Problem, state: State) -> None:
         self.problem = problem
@@ -70,52 +70,54 @@ class _Scene:
         return group in self.problem.variables
 
     def turned(self) -> float:
-        """By how much at most from the mean direction, degrees."""
+        """Returns the largest angle of an optical axis to the mean one, degrees."""
         axis = self.axes.mean(axis=0)
         axis /= max(np.linalg.norm(axis), 1e-12)
         return float(np.rad2deg(np.arccos(np.clip(np.min(self.axes @ axis), -1, 1))))
 
     def moves(self) -> bool:
-        """Far enough to show depths."""
+        """Returns True if the camera moves far enough to show depths."""
         apart = self.points[self.seen] - self.centres.mean(axis=0)
         distance = np.linalg.norm(apart, axis=1)
-        return not len(distance) or bool(self.reach > NEAR * np.median(distance))
+        return not len(distance) or bool(
+            self.reach > MIN_PATH_TO_DISTANCE * np.median(distance)
+        )
 
     def camera(self) -> str:
-        """What the camera does that keeps things from being seen."""
+        """Returns the motion of the camera that leaves quantities undetermined."""
         if not self.moves():
             does = "turns but does not move" if self.turned() > 1 else "stands still"
             return f"the camera {does}"
         along = np.ptp(self.centres @ self.axes.mean(axis=0))
-        if self.turned() < STRAIGHT and along < 0.2 * self.reach:
+        if self.turned() < MIN_ROTATION_DEG and along < 0.2 * self.reach:
             return "the camera moves parallel to its image and does not turn"
         return "too few points, or the camera hardly moves"
 
     def has_size(self) -> bool:
-        """Whether something ties the map to metres, or to a unit at all."""
+        """Returns True if people or priors fix the unit of the map."""
         ties = LandmarkPrior, CameraPrior
         return bool(len(self.places)) or any(
             isinstance(x, ties) for x in self.problem.factors
         )
 
     def is_steady(self) -> bool:
-        """Whether something ties cameras to those before."""
+        """Returns True if a factor couples cameras of different frames."""
         return any(
             isinstance(x, FrameFactor) and not x.of_people and x.num_lags > 1
             for x in self.problem.factors
         )
 
     def stand_still(self) -> list[int]:
-        """The people who do not walk, nor otherwise move their pelvis."""
+        """Returns the people whose pelvis moves less than `MIN_TRAVEL_M`."""
         far = [
             np.max(np.ptp(place[here], axis=0)) if here.any() else 0.0
             for place, here in zip(self.places, self.present, strict=True)
         ]
-        return [person for person, reach in enumerate(far) if reach < STILL]
+        return [person for person, reach in enumerate(far) if reach < MIN_TRAVEL_M]
 
 
 def _observations(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Frame and landmark of each observation that counts."""
+    """Returns the frame and landmark of each observation with a finite sigma."""
     pairs = [
         np.stack([np.asarray(x.frame), np.asarray(x.landmark)])[:, np.isfinite(x.sigma)]
         for x in problem.factors
@@ -126,7 +128,7 @@ def _observations(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _deviation(covariance) -> np.ndarray:
-    """Root of the trace: of a place, m."""
+    """Returns the root of the trace, m: the standard deviation of a position."""
     variance = np.trace(np.asarray(covariance), axis1=-2, axis2=-1)
     return np.sqrt(np.maximum(variance, 0.0))
 
@@ -135,7 +137,7 @@ def _scale(scene: _Scene, spread: Marginals) -> Iterator[str]:
     if not scene.has("scale"):
         return
     share = float(np.sqrt(max(float(spread.scale), 0.0))) / scene.scale
-    if share < UNKNOWN:
+    if share < MAX_RELATIVE_DEVIATION:
         return
     people = len(scene.places)
     still = scene.stand_still()
@@ -144,7 +146,7 @@ def _scale(scene: _Scene, spread: Marginals) -> Iterator[str]:
     elif len(still) == people:
         who = "the person stands" if people == 1 else "all people stand"
         why = f"{who} still"
-    elif scene.reach < STILL:
+    elif scene.reach < MIN_TRAVEL_M:
         why = "the camera hardly moves"
     else:
         why = "nothing links people's motion to the map, or nothing tells how far it is"
@@ -167,13 +169,15 @@ def _focal_length(scene: _Scene, spread: Marginals) -> Iterator[str]:
     )
     if any(isinstance(x, AspectRatioPrior) for x in scene.problem.factors):
         before /= np.sqrt(2)  # known twice
-    if not deviation < min(UNKNOWN * size, NO_BETTER * before):
+    if not deviation < min(
+        MAX_RELATIVE_DEVIATION * size, MAX_POSTERIOR_TO_PRIOR * before
+    ):
         share = deviation / size
         yield f"focal length: known to {share:.0%} only; {scene.camera()}."
 
 
 def _halves(scene: _Scene, spread: Marginals) -> Iterator[str]:
-    """Parts of the video that share no landmark have no common map."""
+    """Reports parts of the video that share no landmark, and so have no common map."""
     if not scene.has("cameras") or not len(scene.frame):
         return
     t, l = len(scene.centres), len(scene.points)
@@ -199,7 +203,7 @@ def _landmarks(scene: _Scene, spread: Marginals) -> Iterator[str]:
         yield "size of the map: nothing tells it, and one camera shows none."
         return
     depth = np.linalg.norm(scene.points - scene.centres.mean(axis=0), axis=1)
-    lost = seen & ~(_deviation(spread.landmarks) < UNKNOWN * depth)
+    lost = seen & ~(_deviation(spread.landmarks) < MAX_RELATIVE_DEVIATION * depth)
     if lost.sum() > 0.5 * seen.sum():
         count = f"{int(lost.sum())} of {int(seen.sum())}"
         yield f"depth of {count} landmarks: {scene.camera()}."
@@ -216,7 +220,7 @@ def _cameras(scene: _Scene, spread: Marginals) -> Iterator[str]:
             yield f"cameras of {blind} frames: no landmark is seen in them."
         return
     reach = max(scene.reach, 1e-9)
-    lost = ~(_deviation(spread.cameras) < UNKNOWN * reach)
+    lost = ~(_deviation(spread.cameras) < MAX_RELATIVE_DEVIATION * reach)
     if lost[1:].any():
         yield f"centres of {int(lost[1:].sum())} cameras: {scene.camera()}."
 
@@ -226,12 +230,14 @@ def _people(scene: _Scene, spread: Marginals) -> Iterator[str]:
         if scene.has("roots"):
             apart = scene.places[person] - scene.centres
             distance = np.linalg.norm(apart, axis=1)
-            lost = ~(_deviation(spread.people[person]) < UNKNOWN * distance)
+            lost = ~(
+                _deviation(spread.people[person]) < MAX_RELATIVE_DEVIATION * distance
+            )
             lost &= scene.present[person]
             if lost.any():
                 yield f"place of person {person} in {int(lost.sum())} frames."
         if scene.has("shapes"):
             # Shape components are in standard deviations of the population.
             deviation = float(np.sqrt(max(float(spread.shapes[person, 0, 0]), 0.0)))
-            if not deviation < NO_BETTER:
+            if not deviation < MAX_POSTERIOR_TO_PRIOR:
                 yield f"size of person {person}: little better known than anybody's."

@@ -1,7 +1,6 @@
 """Pads a problem to the sizes of its layout, so that videos share compiled programs.
 
-What is added has no weight: measurements with `sigma = inf`, variables that may not
-move.
+Padding has no effect: its measurements have `sigma = inf`, its variables are held.
 """
 
 import dataclasses
@@ -26,7 +25,7 @@ from bodyslam_jax.graph import (
 
 
 def pad(problem: Problem, state: State) -> tuple[Problem, State]:
-    """The same problem with `num_chunks * CHUNK` frames and more landmark slots."""
+    """Pads to `num_chunks * CHUNK` frames and the layout's number of landmarks."""
     layout = problem.layout
     frames = layout.num_chunks * CHUNK - len(state.cameras)
     landmarks = layout.num_landmarks - len(state.landmarks)
@@ -56,13 +55,13 @@ def pad(problem: Problem, state: State) -> tuple[Problem, State]:
 
 
 def _typed(tree):
-    """The same numbers, none of them weakly typed: that alone would compile anew."""
+    """Returns the tree without weak types, which would make JAX compile anew."""
     strong = lambda x: jnp.asarray(x, x.dtype) if eqx.is_array(x) else x
     return jax.tree.map(strong, tree)
 
 
 def unpad(state: State, num_frames: int, num_landmarks: int) -> State:
-    """Drops what `pad` added."""
+    """Removes the frames and landmarks that `pad` added."""
     cut = lambda x: x if isinstance(x, jax.core.Tracer) else np.asarray(x)
     return State(
         scale=state.scale,

@@ -12,12 +12,12 @@ from bodyslam_jax.graph import TURNS, Problem
 
 
 def posture_width(problem: Problem) -> int:
-    """The number p of coordinates of one posture in a step."""
+    """Returns the number p of coordinates of one posture in a step."""
     return TURNS if problem.basis is None else problem.basis.shape[1]
 
 
 def basis_of(problem: Problem, dtype) -> Float[Array, "69 p"]:
-    """The matrix B from coordinates to turns (rad), with no turn held."""
+    """Returns the matrix B from coordinates to turns (rad), with no turn held."""
     if problem.basis is None:
         return jnp.eye(TURNS, dtype=dtype)
     return problem.basis.astype(dtype)

@@ -1,9 +1,9 @@
 """The reduced system of chunks: people, cameras, and an arrow of globals.
 
-After landmarks, inner postures and inner roots are gone, a chunk keeps for each person
-its last posture and its last roots, and its cameras. People couple with the next chunk
-only, cameras over the band of the tracks, all with the globals. Memory grows linearly
-with frames.
+After landmarks, inner postures and inner roots are eliminated, a chunk keeps its
+cameras and, for each person, the last posture and the last roots. People couple with
+the next chunk only, cameras over the band of the tracks, and all of them with the
+globals. Memory grows linearly with the number of frames.
 
 Chunks stand in the order of time, or in that of `Layout.order`, where the next in time
 is up to `reach` places away, either way.
@@ -24,7 +24,7 @@ from bodyslam_jax.solver.blocks import (
     shifted,
 )
 from bodyslam_jax.solver.elimination.schur import ReducedCameras
-from bodyslam_jax.solver.front import KEPT, Window, spread
+from bodyslam_jax.solver.front import KEPT_GROUPS, Window, spread
 
 
 class Chunks(eqx.Module):
@@ -39,7 +39,7 @@ class Chunks(eqx.Module):
     pivot: Float[Array, "n q q"]
     coupling: Float[Array, "n r q"]
     corner: Float[Array, "a1 a1"]
-    """Arrow and right-hand side."""
+    """Block of the arrow, with the right-hand side."""
 
 
 def assemble(
@@ -51,7 +51,7 @@ def assemble(
     damping: dict[str, Array],
     order: Int[Array, " n"] | None,
 ) -> Chunks:
-    """Puts all blocks of the kept variables in place; all but `reduced` come in the
+    """Assembles the blocks of the kept variables; all but `reduced` are given in the
     order of time."""
     n, g = sizes.chunks, sizes.arrow
     dtype = reduced.band.dtype
@@ -110,12 +110,12 @@ def assemble(
 def add_marginal_prior(
     chunks: Chunks, prior: PriorBlocks, sizes: Sizes, window: Window
 ) -> Chunks:
-    """The system of chunks with the prior's blocks; chunks in the order of time."""
+    """Adds the blocks of a marginal prior; chunks are in the order of time."""
     matrix, pivot, coupling = prior.matrix, chunks.pivot, chunks.coupling
     own, head = sizes.people * prior.person, sizes.people * window.person
     count = (len(matrix) - own - sizes.globals) // CAMERAS
     person = np.arange(prior.person)
-    # Roots are the last ones, in a window that may have more.
+    # The prior has the last roots only, of a window that may have more.
     roots = person >= prior.person - 6 * prior.reach
     person = person + roots * 6 * (window.reach - prior.reach)
     people = np.arange(sizes.people)[:, None] * window.person + person
@@ -142,7 +142,8 @@ def add_marginal_prior(
 def _in_place(
     after: Float[Array, "n q q"], order: Int[Array, " n"], reach: int, count: int
 ) -> Float[Array, "n c q"]:
-    """Blocks of the next chunk in time (rows) against each, where they stand."""
+    """Places the blocks of the next chunk in time (rows) against each chunk, in the
+    order in which chunks stand."""
     n, q, _ = after.shape
     head = q - CAMERAS
     place = jnp.argsort(order)
@@ -151,8 +152,8 @@ def _in_place(
     block = jnp.where(turned, _transposed(after), after)
     apart = jnp.abs(follower - place)[:, None]
     first = jnp.minimum(place, follower)
-    # The last has no follower. Between the last of the video and padding, which may
-    # stand far from it, there is nothing.
+    # The last has no follower. The last of the video does not couple with padding,
+    # which may stand far from it.
     first = jnp.where((jnp.arange(n) < n - 1) & (apart[:, 0] <= reach), first, n)
     people = (apart - 1) * head + jnp.arange(head)
     cameras = reach * head + (apart - 1) * CAMERAS + jnp.arange(CAMERAS)
@@ -170,9 +171,10 @@ def _transposed(x):
 
 
 def _parts(kept: Float[Array, "n k k"], window: Window) -> dict[tuple[str, str], Array]:
-    """Blocks of one person, rows by columns: what it keeps of the chunk (`own`) and of
-    the `next` one; cameras; globals with the right-hand side (`common`)."""
-    at = window.slices(KEPT)
+    """Returns the blocks of one person, rows by columns: its kept variables of the
+    chunk (`own`) and of the `next` one, cameras, and globals with the right-hand side
+    (`common`)."""
+    at = window.slices(KEPT_GROUPS)
     old = slice(at["before"].start, at["old_roots"].stop)
     own = slice(at["sep"].start, at["roots"].stop)
     old_cameras, cameras, common = (at[k] for k in ("old_cameras", "cameras", "common"))
@@ -196,7 +198,8 @@ def _parts(kept: Float[Array, "n k k"], window: Window) -> dict[tuple[str, str],
 
 
 def _cameras(lin, sizes, damping):
-    """Chunks of cameras against themselves and (rows) the next ones, from factors."""
+    """Returns the blocks of each chunk's cameras with themselves and with those of the
+    next chunk (rows), from factors other than landmarks."""
     blocks = {k[2]: v for k, v in lin.blocks.items() if k[:2] == ("alone", "alone")}
     for (first, other, lag), block in lin.blocks.items():
         if (first, other) == ("camera", "camera"):
@@ -217,7 +220,7 @@ def _cameras(lin, sizes, damping):
 
 
 def _reduced_tail(sizes, reduced):
-    """What landmarks leave of it, chunks as they stand."""
+    """Returns the Schur complement of landmarks on arrow (rows) and cameras."""
     n, g, i = sizes.chunks, sizes.arrow, sizes.intrinsics
     tail = jnp.zeros((n, g + 1, CAMERAS), reduced.band.dtype)
     if i:
@@ -229,7 +232,7 @@ def _reduced_tail(sizes, reduced):
 
 
 def _camera_tail(lin, sizes, dtype):
-    """Arrow and right-hand side (rows) against each chunk's cameras."""
+    """Returns arrow and right-hand side (rows) against each chunk's cameras."""
     n, g = sizes.chunks, sizes.arrow
     tail = jnp.zeros((n, g + 1, CAMERAS), dtype)
     alone = lin.blocks.get(("alone", "globals", 0))

@@ -1,8 +1,8 @@
-"""Landmarks that lost their way are triangulated anew.
+"""Triangulates diverged landmarks anew.
 
 While cameras are still wrong, a point may fit best at infinity, or very near, where its
-cost is so flat that no step brings it back. Given the cameras, a landmark's cost is its
-own: a better place for one lowers the cost of all.
+cost is so flat that no step brings it back. Given the cameras, landmarks are
+independent: a better position of one lowers the total cost.
 """
 
 import equinox as eqx
@@ -20,21 +20,21 @@ from bodyslam_jax.graph import (
     squared_norm,
 )
 
-_PASSES = 5
-"""Weights follow from the place before; at first they are all alike."""
-_SHALLOW = 0.1
-"""Least depth that is divided by, of the one in the camera of reference."""
+_NUM_PASSES = 5
+"""Number of passes; weights follow from the pass before, at first all are 1."""
+_MIN_RELATIVE_DEPTH = 0.1
+"""Least depth that is divided by, as a share of that in the reference camera."""
 
 
 def tracks_of(problem: Problem) -> Reprojection | None:
-    """The factor that sees landmarks, if there is one."""
+    """Returns the factor of landmark observations, if there is one."""
     return next((f for f in problem.factors if isinstance(f, Reprojection)), None)
 
 
 def cost_by_landmark(
     problem: Problem, tracks: Reprojection, state: State
 ) -> tuple[Float[Array, " l"], Float[Array, " l"]]:
-    """Twice the cost of each landmark's observations, and of what else is known."""
+    """Returns twice the cost of each landmark's observations, and of its priors."""
     rho = lambda f: f.loss.rho(squared_norm(residual_of(f, state)))
     none = jnp.zeros(len(state.landmarks), state.scale.dtype)
     known = none
@@ -50,12 +50,12 @@ def triangulate_anew(
     terms: Float[Array, " k"],
     least: float | Float[Array, ""],
 ) -> tuple[State, Float[Array, " k"]]:
-    """The state with those landmarks moved to where their sightings meet that fit
-    better there, and its costs by factor.
+    """Triangulates all landmarks from their observations, and moves those that fit
+    better there; returns the state and its cost by factor.
 
     Args:
-        terms: costs by factor of the state that is given.
-        least: by how much a landmark's cost has to fall for it to be moved.
+        terms: cost by factor at `state`.
+        least: least decrease of a landmark's cost for which it is moved.
     """
     tracks = tracks_of(problem)
     if tracks is None:
@@ -84,7 +84,7 @@ def triangulate_anew(
 
     alike = jnp.isfinite(tracks.sigma).astype(state.scale.dtype)
     start = (alike, state.landmarks, first)
-    (_, place, best), _ = jax.lax.scan(once, start, length=_PASSES)
+    (_, place, best), _ = jax.lax.scan(once, start, length=_NUM_PASSES)
     costs = {
         Reprojection: 0.5 * jnp.sum(best[0]),
         LandmarkPrior: 0.5 * jnp.sum(best[1]),
@@ -97,9 +97,9 @@ def triangulate_anew(
 
 
 def _sightings(tracks, state, reference):
-    """What a landmark at `(a, b, 1) / ρ` in a camera that sees it looks like from where
-    it is sighted: `A (a, b, ρ, 1)` is along the ray `(u, v, 1)`, and `A` and the ray
-    are what is returned."""
+    """Returns the matrix `A` and the ray `(u, v, 1)` of each observation, such that a
+    landmark at `(a, b, 1) / ρ` in its reference camera has `A (a, b, ρ, 1)` along the
+    ray."""
     camera = state.cameras[tracks.frame]
     ray = unproject(state.intrinsics, tracks.pixel)
     turned = jnp.einsum("mki,mkj->mij", camera[:, :3, :3], reference[:, :3, :3])
@@ -110,10 +110,11 @@ def _sightings(tracks, state, reference):
 
 
 def _meeting(rows, weight, landmark, count):
-    """`(a, b, ρ)` of each landmark in the least-squares sense, and whether there is
-    such a point in front of the camera.
+    """Returns the least-squares `(a, b, ρ)` of each landmark, and whether such a point
+    exists in front of the reference camera.
 
-    In inverse depth there is no drawing near, as where rays come closest in space.
+    In inverse depth the estimate has no bias towards the cameras, unlike the point of
+    closest approach of the rays.
     """
     seen, ray = rows
     sums = 0.0
@@ -140,11 +141,13 @@ def _meeting(rows, weight, landmark, count):
 
 
 def _weight(rows, found, tracks, state):
-    """Weights under which squares act as pixel errors do, without their squares where
-    they are long: one outlier among a few sightings does not carry the point away."""
+    """Returns weights that turn algebraic squares into squared pixel errors, and into
+    absolute ones above one sigma, so that one outlier does not carry a point away."""
     seen, ray = rows
     p_C = jnp.einsum("mij,mj->mi", seen[..., :3], found) + seen[..., 3]
-    depth = jnp.where(jnp.abs(p_C[:, 2]) > _SHALLOW, p_C[:, 2], _SHALLOW)
+    depth = jnp.where(
+        jnp.abs(p_C[:, 2]) > _MIN_RELATIVE_DEPTH, p_C[:, 2], _MIN_RELATIVE_DEPTH
+    )
     sigma = tracks.sigma / jnp.mean(state.intrinsics[:2])
     error = squared_norm(p_C[:, :2] / depth[:, None] - ray[:, :2]) / sigma**2
     return 1 / (sigma**2 * depth**2 * jnp.sqrt(jnp.maximum(error, 1.0)))

@@ -1,4 +1,4 @@
-"""What `solve` is asked to do: by which solver, in which stages."""
+"""The solvers and stages that `solve` accepts."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
@@ -14,26 +14,26 @@ class Stage:
     """One run of the solver with some groups of variables free."""
 
     free: tuple[str, ...] = VARIABLES
-    """Among the fields of `State`; what the problem holds stays held."""
+    """Groups among the fields of `State`; what the problem holds stays held."""
     max_steps: int = 50
     rtol: float = 1e-8
-    """Relative decrease of the cost at which to stop."""
+    """Relative decrease of the cost below which the stage ends."""
     atol: float = 0.0
-    """The same in units of the cost: a half is what a standard deviation is worth."""
+    """Absolute decrease likewise; a residual of one standard deviation costs a half."""
 
     def __post_init__(self):
         check_names(self.free)
         if self.max_steps < 0:
             raise ValueError(f"max_steps: {self.max_steps}, expected 0 or more.")
         for name in ("rtol", "atol"):
-            # Not a NaN either, which no decrease is below.
+            # This refuses NaN as well.
             if not getattr(self, name) >= 0:
                 found = getattr(self, name)
                 raise ValueError(f"{name}: {found}, expected 0 or more.")
 
 
 def check_schedule(solver: Any, schedule: Any) -> None:
-    """Refuses a solver that is none, and stages of which none takes a step.
+    """Refuses an unknown solver, and a schedule that takes no step.
 
     **Raises:** `ValueError` that says what was found and what was expected.
     """
@@ -67,13 +67,13 @@ PAPER_SCHEDULE = (
     Stage(("scale", "cameras", "roots", "landmarks"), max_steps=20, rtol=1e-4),
     Stage(),
 )
-"""Section 3.6: first where cameras and people are, then everything."""
+"""Section 3.6: first scale, cameras, roots and landmarks, then all variables."""
 PAPER_STEPS = (200, 100)
-"""The paper's number of steps in each, which are of first order."""
+"""The paper's number of first-order steps in each stage."""
 
 
 def paper_schedule(solver: Solver) -> tuple[Stage, ...]:
-    """`PAPER_SCHEDULE`; with the paper's own number of steps for first-order ones."""
+    """Returns `PAPER_SCHEDULE`, with the paper's numbers of steps for `adam`."""
     if solver != "adam":
         return PAPER_SCHEDULE
     return tuple(

@@ -1,16 +1,16 @@
-"""The curvature that `J^T J` leaves out, for the last steps and for covariances.
+"""The second-order term of the Hessian, for the last steps and for covariances.
 
-Where a limb turns towards the camera keypoints hardly show it, and `J^T J` at an
-estimate, whose errors make up some of that turn, takes them to say more than they do.
-The observed information has what residuals bend, too (Efron and Hinkley, 1978). Here it
-has that of keypoints, in which turns are large; weights of robust losses stay as they
-are.
+Keypoints hardly observe a limb that turns towards the camera, and `J^T J` at an
+estimate, whose errors contain some of that turn, overstates their information. The
+observed information includes the term Σ rᵢ ∇²rᵢ of the residuals (Efron and Hinkley,
+1978). Here it is that of keypoints, in which turns are large; weights of robust losses
+are constant.
 
-Steps of `J^T J` alone are too short there, for dozens of iterations that gain next to
-nothing each. So once they gain little, steps know a share of the curvature as well. At
-first there may be limbs about to turn over, where all of it has no minimum: then the
-share is halved, and it grows again with each step that is accepted. One share serves
-all: each chunk of frames has a minimum by itself, as limbs lean over for seconds.
+Steps of `J^T J` alone are too short there, for dozens of iterations of little gain. So
+near convergence the Hessian includes a share of the term. With all of it, limbs that
+are about to turn over may leave the Hessian indefinite: then the share is halved, and
+it grows again with each accepted step. One share serves all frames, although each chunk
+has a minimum of its own, as limbs lean over for seconds.
 """
 
 import dataclasses
@@ -24,14 +24,14 @@ from bodyslam_jax.graph import TURNS, KeypointReprojection, Problem, State
 from bodyslam_jax.solver.blocks import Linearisation, Sizes, cast, mask_of
 from bodyslam_jax.solver.posture import to_coordinates
 
-_LITTLE = 1e-3
-"""Share of the cost: after a step that gains no more, curvature comes in."""
-_FIRST, _MORE, _LESS = 0.3, 1.2, 0.5
-"""The share of it then, and its factors after a step that was accepted, or not."""
+_CURVATURE_RTOL = 1e-3
+"""Relative decrease of the cost below which a step adds the second-order term."""
+_INITIAL_SHARE, _SHARE_GROWTH, _SHARE_REDUCTION = 0.3, 1.2, 0.5
+"""First share of the term, and its factors after an accepted and a rejected step."""
 
 
 class Curvature(eqx.Module):
-    """What keypoints add to some of the blocks of `J^T J`."""
+    """The second-order term Σ rᵢ ∇²rᵢ of the keypoint factors, by blocks of `J^T J`."""
 
     blocks: dict[tuple[str, str, int], Array]
 
@@ -42,16 +42,16 @@ def next_share(
     gained: Float[Array, ""],
     cost: float | Float[Array, ""],
 ) -> Float[Array, ""]:
-    """How much of the curvature the next step knows.
+    """Returns the share of the second-order term in the next step.
 
     Args:
-        share: that the step before knew.
-        gained: decrease of the cost in it, if it was accepted.
-        cost: before it.
+        share: that in the step before.
+        gained: decrease of the cost by that step, if it was accepted.
+        cost: cost before that step.
     """
-    more = jnp.where(share > 0, jnp.minimum(_MORE * share, 1.0), _FIRST)
-    more = jnp.where((share > 0) | (gained < _LITTLE * cost), more, 0.0)
-    return jnp.where(accepted, more, _LESS * share).astype(share.dtype)
+    more = jnp.where(share > 0, jnp.minimum(_SHARE_GROWTH * share, 1.0), _INITIAL_SHARE)
+    more = jnp.where((share > 0) | (gained < _CURVATURE_RTOL * cost), more, 0.0)
+    return jnp.where(accepted, more, _SHARE_REDUCTION * share).astype(share.dtype)
 
 
 def curvature_if(
@@ -61,7 +61,7 @@ def curvature_if(
     state: State,
     sizes: Sizes,
 ) -> Curvature:
-    """`curvature_of`, or zeros."""
+    """Returns `curvature_of` where it is needed, else zeros."""
     some = lambda _: curvature_of(problem, lin, state, sizes)
     like = eqx.filter_eval_shape(some, None)
     none = lambda _: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
@@ -71,8 +71,8 @@ def curvature_if(
 def curvature_of(
     problem: Problem, lin: Linearisation, state: State, sizes: Sizes
 ) -> Curvature:
-    """Of keypoints, for those blocks that there are: of groups that are all held there
-    are none."""
+    """Returns the second-order term of all keypoint factors, for the blocks that `lin`
+    has."""
     each = [
         _blocks_of(factor, problem, state, sizes)
         for factor in problem.factors
@@ -88,7 +88,7 @@ def curvature_of(
 def add_second_order(
     lin: Linearisation, curvature: Curvature, share: float | Float[Array, ""] = 1.0
 ) -> Linearisation:
-    """The same equations with a share of the curvature."""
+    """Returns the normal equations with a share of the second-order term added."""
     some = lambda more: jnp.asarray(share, more.dtype) * more
     add = lambda x, more: x + jnp.where(share > 0, some(more), 0)
     blocks = {
@@ -109,18 +109,18 @@ def _blocks_of(factor, problem, state, sizes):
     root, pose = turns[..., :3, :3], turns[..., 3:, 3:]
     with_root = by_posture(turns[..., 3:, :3]).swapaxes(-1, -2)
     blocks = {
-        ("root", "root", 0): jnp.pad(root, (*_NONE, (0, 3), (0, 3))),
-        ("pose", "root", 0): jnp.pad(with_root, (*_NONE, (0, 0), (0, 3))),
+        ("root", "root", 0): jnp.pad(root, (*_NO_PADDING, (0, 3), (0, 3))),
+        ("pose", "root", 0): jnp.pad(with_root, (*_NO_PADDING, (0, 0), (0, 3))),
         ("pose", "pose", 0): by_posture(by_posture(pose)),
     }
     if "shapes" in problem.variables:
         before = (sizes.common, 0)
-        wide = lambda x, rows: jnp.pad(x, (*_NONE, (0, rows), before))
+        wide = lambda x, rows: jnp.pad(x, (*_NO_PADDING, (0, rows), before))
         blocks["root", "globals", 0] = wide(by_shape[..., :3, :], 3)
         of_postures = by_posture(by_shape[..., 3:, :]).swapaxes(-1, -2)
         blocks["pose", "globals", 0] = wide(of_postures, 0)
     return Curvature(cast(blocks, sizes.dtype))
 
 
-_NONE = ((0, 0), (0, 0))
-"""Padding of people and frames."""
+_NO_PADDING = ((0, 0), (0, 0))
+"""No padding of the axes of people and frames."""

@@ -1,8 +1,8 @@
-"""The inverse of the normal equations, but only where it is asked for.
+"""Selected blocks of the inverse of the normal equations.
 
-A second pass along the chunks, from the last to the first, gives the covariance of all
-that stands in one front (Takahashi's recursion), from the same factor that gives a
-step. The dense inverse is never formed.
+A pass along the chunks, from the last to the first, gives the covariance of all
+variables in one front (Takahashi's recursion), from the same factor that gives a step.
+The dense inverse is never formed.
 """
 
 import jax
@@ -22,9 +22,9 @@ def selected_inverse(
     sizes: Sizes,
     order: Int[Array, " n"] | None,
 ) -> tuple[Float[Array, "n f f"], Float[Array, "n w w"], Float[Array, "a a"]]:
-    """Covariance of each chunk's roots (all of them, person by person), cameras and the
-    globals, in the order of time; of the cameras of its band with the globals, chunks
-    as they stand; of the whole arrow."""
+    """Returns three covariances: of each chunk's roots (all, person by person), cameras
+    and the globals, in the order of time; of the cameras in its band with the globals,
+    chunks as they stand; and of the whole arrow."""
     r, q = factor.side.shape[1:]
     g, arrow = sizes.globals, sizes.arrow
     head = q - CAMERAS
@@ -42,7 +42,8 @@ def selected_inverse(
     kept, band = jnp.concatenate(kept), jnp.concatenate([own_cameras, cameras, last])
 
     def pair(apart):
-        """This chunk, the one that stands so many places after it, and the globals."""
+        """Returns the indices of this chunk, the one `apart` places after it, and the
+        globals."""
         block = lambda start, width: start + (apart - 1) * width + jnp.arange(width)
         other = block(q, head), block(q + near, CAMERAS)
         return jnp.concatenate([own_people, own_cameras, *other, last])
@@ -73,8 +74,8 @@ def selected_inverse(
         turned = jnp.r_[q : 2 * q, 0:q, 2 * q : 2 * q + g]
         before = before[follower][:, turned][:, :, turned]
         pairs = jnp.where((ahead > 0)[:, None, None], after[place], before)
-    # Roots that went with their chunk touch the chunk before: both stand in a pair. The
-    # first chunk has none before it.
+    # Roots eliminated with their chunk couple with the chunk before: both stand in a
+    # pair. The first chunk has none before it.
     at = q + jnp.arange(q + g)
     own = jnp.r_[0:q, 2 * q : 2 * q + g]
     alone = jnp.zeros_like(pairs[:1])
@@ -88,9 +89,9 @@ def selected_inverse(
 def _with_inner(
     pair: Float[Array, "p p"], roots: RootFactor | None, window: Window, sizes: Sizes
 ) -> Float[Array, "f f"]:
-    """Covariance of all roots of a chunk, its cameras and the globals, from that of
-    what two chunks kept: eliminated roots follow from it, with a spread of their own.
-    """
+    """Returns the covariance of all roots of a chunk, its cameras and the globals, from
+    that of the kept variables of two chunks: eliminated roots are linear in these, with
+    a conditional covariance of their own."""
     g, last, width = sizes.globals, 6 * window.reach, window.person
     q = (len(pair) - g) // 2
     eye = jnp.eye(len(pair), dtype=pair.dtype)
@@ -117,7 +118,7 @@ def _with_inner(
 
 
 def _diagonal(first: Array, second: Array, more: int) -> Array:
-    """Two blocks down a diagonal, and `more` of zeros."""
+    """Returns the block-diagonal matrix of both blocks, and `more` rows of zeros."""
     a, b = len(first), len(second)
     first = jnp.pad(first, ((0, b + more),) * 2)
     return first + jnp.pad(second, ((a, more),) * 2)

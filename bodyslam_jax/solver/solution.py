@@ -1,4 +1,4 @@
-"""What `solve` gives back."""
+"""The result of `solve`: state, status, cost and history."""
 
 import dataclasses
 
@@ -12,25 +12,28 @@ from jaxtyping import Array, Bool, Float
 from bodyslam_jax.graph import State
 from bodyslam_jax.solver.lm_state import Final, History
 
-_WORDS = (
+_STATUS_BY_RESULT = (
     (optx.RESULTS.successful, "converged"),
     (optx.RESULTS.nonlinear_max_steps_reached, "ran out of steps"),
     (optx.RESULTS.nonfinite, "cost is not finite"),
 )
-_OTHERWISE = "no step lowers the cost"
-_BETTER = "converged, but a better scale is known: {:.6g}"
+_DIVERGENCE_STATUS = "no step lowers the cost"
+_BETTER_SCALE_STATUS = "converged, but a better scale is known: {:.6g}"
 
 
 class Solution(eqx.Module):
-    """The best state found. What failed says so in `status`; a state is never NaN, but
-    for a start within `jit` or `vmap` that was, which comes back as it is."""
+    """The best state found, and how the solve ended.
+
+    A failure is reported by `status`. The state is finite, unless the start was not,
+    within `jit` or `vmap`: such a start is returned as it is.
+    """
 
     state: State
     result: optx.RESULTS
     cost: Float[Array, ""]
     """Negative log-likelihood at `state`."""
     histories: tuple[History, ...]
-    """Of each stage."""
+    """History of each stage."""
     num_steps: tuple[Array, ...]
     """Iterations of each stage, accepted or not."""
     first_cost: Float[Array, ""]
@@ -42,29 +45,30 @@ class Solution(eqx.Module):
 
     @property
     def status(self) -> str | np.ndarray:
-        """`converged`, or what kept it from that; of mapped solves an array of such.
-        Where robust losses leave several scales, it says if a better one is known."""
-        found = np.array(_OTHERWISE)
-        for result, words in _WORDS:
+        """Returns `converged`, or the reason of failure; an array of such for mapped
+        solves. Where robust losses leave several scales, it says if a better one is
+        known."""
+        found = np.array(_DIVERGENCE_STATUS)
+        for result, words in _STATUS_BY_RESULT:
             found = np.where(self.result == result, words, found)
         better = np.asarray(self.better_scale)
-        known = [_BETTER.format(x) for x in better.ravel()]
+        known = [_BETTER_SCALE_STATUS.format(x) for x in better.ravel()]
         other = np.isfinite(better) & (found == "converged")
         found = np.where(other, np.reshape(known, better.shape), found)
         return found if found.ndim else str(found)
 
 
 def is_finite(state: State) -> Bool[Array, ""]:
-    """Whether all numbers of a state are."""
+    """Returns True if every array of the state is finite."""
     leaves = [jnp.isfinite(x).all() for x in jax.tree.leaves(state)]
     return jnp.stack(leaves).all()
 
 
 def outcome(start, best, result, stats) -> tuple[Solution, Final]:
-    """What the loop leaves behind, as a solution; the start, if no cost was finite."""
+    """Converts the result of the loop; the start, if no cost was finite."""
     better = jnp.isfinite(stats["cost"]) & is_finite(best)
     best = jax.tree.map(lambda new, old: jnp.where(better, new, old), best, start)
-    # A number that no measurement sees may be NaN from the start, and the cost not.
+    # A coordinate that no measurement sees may be NaN while the cost is finite.
     result = optx.RESULTS.where(is_finite(best), result, optx.RESULTS.nonfinite)
     stages = range(len(stats["steps"]))
     histories = tuple(jax.tree.map(lambda x: x[i], stats["history"]) for i in stages)
@@ -82,7 +86,7 @@ def outcome(start, best, result, stats) -> tuple[Solution, Final]:
 
 
 def only(solution: Solution, count: int) -> Solution:
-    """Without the idle stages that make all schedules one program."""
+    """Returns the solution without the idle stages that pad a schedule."""
     return dataclasses.replace(
         solution,
         histories=solution.histories[:count],

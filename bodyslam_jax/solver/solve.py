@@ -1,4 +1,4 @@
-"""`solve`: a problem and a first state in, the best state and how it was found out."""
+"""`solve` minimises the cost of a problem from a first state."""
 
 import dataclasses
 import functools
@@ -26,8 +26,8 @@ from bodyslam_jax.solver.padding import pad, unpad
 from bodyslam_jax.solver.schedule import Solver, Stage, check_names, check_schedule
 from bodyslam_jax.solver.solution import Solution, only, outcome
 
-HISTORY = 64
-"""The length of a history is a multiple of this: schedules share a compilation."""
+HISTORY_LENGTH_UNIT = 64
+"""Number of rows of a history is a multiple of this: schedules share a compilation."""
 
 
 def solve(
@@ -44,24 +44,25 @@ def solve(
     - `solver`: `structured` is the one for real videos. `adam` takes first-order steps,
       as many as a stage has. `optimistix_lm` and `jaxopt_lm` are dense
       Levenberg-Marquardt, for small problems: larger ones are refused.
-    - `schedule`: stages one after another, each with its free variables, most steps
-      and tolerances; `PAPER_SCHEDULE` is the paper's.
-    - `damping`: of the first step of each stage, as a share of each variable's own
-      curvature; later steps adapt it, and once they gain little know what keypoints
-      bend, too, which `J^T J` leaves out. 0 is Gauss-Newton: full steps of `J^T J`, as
-      long as they lower the cost. Baselines have their own.
-    - `mixed_precision`: of `structured`, solves for steps in single precision, in two
-      thirds of the time for long videos; residuals, gradients and costs, and so where
-      it ends, keep that of `state`. Flat directions are damped a little more.
+    - `schedule`: stages one after another, each with its free variables, maximum number
+      of steps and tolerances; `PAPER_SCHEDULE` is the paper's.
+    - `damping`: Marquardt's damping of the first step of each stage, as a share of the
+      diagonal of `J^T J`; later steps adapt it. Near convergence the Hessian includes
+      the second-order term Σ rᵢ ∇²rᵢ of the keypoint factors (`second_order.py`). 0 is
+      Gauss-Newton: full steps of `J^T J`, as long as they lower the cost. Baselines
+      have dampings of their own.
+    - `mixed_precision`: `structured` solves for its steps in single precision, in two
+      thirds of the time for long videos; residuals, gradients and costs, and so the
+      minimum, keep the precision of `state`. Flat directions are damped a little more.
 
     Pure: jits, differentiates, and maps over problems or states of one shape: one after
     another on a CPU, which is no slower there, at once elsewhere; `vmap_over_devices`
     gives each device a share. Threads may solve at the same time.
 
-    Derivatives, of `structured`, are those of `state` and `cost` with respect to all of
-    `problem`, by the implicit function theorem; a solution does not depend on where it
-    started. What the last stage holds counts as given, also where an earlier one moved
-    it. They are NaN where their equations could not be solved.
+    `structured` differentiates `state` and `cost` with respect to all of `problem`, by
+    the implicit function theorem; a solution does not depend on where it started. What
+    the last stage holds counts as given, also where an earlier one moved it. The
+    derivatives are NaN where their equations could not be solved.
 
     **Raises:** `ValueError` if `state` does not have the sizes and the precision the
     problem was made for, is not finite, or has poses that are not rigid, if there is no
@@ -103,7 +104,7 @@ def method_of(
     keep: bool = False,
     mixed: bool = False,
 ) -> StructuredLevenbergMarquardt:
-    """The solver of a schedule: of two stages at least, of which one may be idle, so
+    """Returns the solver of a schedule, padded with idle stages to at least two, so
     that one stage, two, and none (for covariances) are the same program."""
     idle = Stage(max_steps=0)
     stages = (*schedule, *(idle,) * (2 - len(schedule)))
@@ -115,7 +116,7 @@ def method_of(
         atol=jnp.asarray([s.atol for s in stages], dtype),
         damping=jnp.asarray(damping, dtype),
         keep=jnp.asarray(keep),
-        length=HISTORY * max(1, -(-longest // HISTORY)),
+        length=HISTORY_LENGTH_UNIT * max(1, -(-longest // HISTORY_LENGTH_UNIT)),
         dtype=np.dtype(np.float32 if mixed else dtype),
     )
 
@@ -127,9 +128,10 @@ def run(
     *,
     alone: bool = False,
 ) -> tuple[Solution, Final]:
-    """All stages on a padded problem, and the equations where they end.
+    """Runs all stages on a padded problem; returns the solution
+    and the final equations.
 
-    `alone` is what `is_alone()` said before anything was traced.
+    `alone` is the value of `is_alone()` before anything was traced.
     """
     given = problem, state, method
     if is_traced(given):
@@ -178,13 +180,13 @@ def _backward(
         found,
         is_leaf=lambda x: x is None,
     )
-    # A stage without steps has moved nothing.
+    # The last stage with steps decides which variables were free.
     taken = [stage for stage in schedule if stage.max_steps] or schedule
     now = restrict(problem, taken[-1].free)
     given = cotangent_of_problem(now, found, full)
     given = dataclasses.replace(given, variables=problem.variables)
     if cotangent.cost is not None:
-        # At a minimum the state's own share of the cost's derivative is 0.
+        # At a minimum the derivative of the cost by the state is 0.
         arrays, static = eqx.partition(problem, eqx.is_inexact_array)
         by_cost = jax.grad(lambda a: eqx.combine(a, static).cost(found))
         more = by_cost(arrays)
@@ -193,7 +195,7 @@ def _backward(
 
 
 def restrict(problem: Problem, free: tuple[str, ...]) -> Problem:
-    """The same problem with only these groups free.
+    """Returns the problem with only these groups of variables free.
 
     **Raises:** `ValueError` for a name that is not among `VARIABLES`.
     """
@@ -203,7 +205,7 @@ def restrict(problem: Problem, free: tuple[str, ...]) -> Problem:
 
 
 def restrict_to_all(problem: Problem, schedule: tuple[Stage, ...]) -> Problem:
-    """The same problem with only the groups free that some stage moves."""
+    """Returns the problem with only those groups free that some stage moves."""
     return restrict(problem, tuple(name for stage in schedule for name in stage.free))
 
 

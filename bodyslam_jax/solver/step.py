@@ -1,7 +1,7 @@
 """One damped step, tried on the true robust cost; the damping after it.
 
 Marquardt's damping, in proportion to each variable's own curvature, with Nielsen's
-update. Landmarks that the step would have thrown off are damped by themselves.
+update. Landmarks whose cost the step would have increased are damped individually.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver.blocks import Linearisation, Sizes
 from bodyslam_jax.solver.line_search import search
 from bodyslam_jax.solver.linear_system import (
-    UNSEEN,
+    UNOBSERVED_DIAGONAL,
     Eliminated,
     damped,
     diagonals,
@@ -24,39 +24,39 @@ from bodyslam_jax.solver.linear_system import (
     solve_step,
 )
 
-GAIN = 1e-4
-"""Least share of the predicted decrease at which a step is accepted."""
-CAUTION = (1e-2, 1e4)
-"""Least and greatest damping of a landmark that a step would have thrown off."""
-SHRINK = 0.1
-"""Least factor of the damping after a good step."""
+MIN_GAIN_RATIO = 1e-4
+"""Least ratio of actual to predicted decrease at which a step is accepted."""
+LANDMARK_DAMPING_RANGE = (1e-2, 1e4)
+"""Least and greatest damping of a landmark whose cost a step would have increased."""
+MIN_DAMPING_FACTOR = 0.1
+"""Least factor by which a good step lowers the damping (Nielsen)."""
 
 
 class Trial(NamedTuple):
-    """A step that was tried, and what the true cost says of it."""
+    """A trial step, with its true robust cost and whether it is accepted."""
 
     eliminated: Eliminated
     damping: Float[Array, ""]
-    """With which the step was found."""
+    """Damping with which the step was computed."""
     length: Float[Array, ""]
-    """Squared, in standard deviations."""
+    """Squared length of the step, in standard deviations: `δ^T diag(H) δ`."""
     predicted: Float[Array, ""]
-    """Decrease of the cost, by the linear part."""
+    """Decrease of the cost that the quadratic model predicts."""
     finite: Bool[Array, ""]
     accepted: Bool[Array, ""]
     state: State
-    """After the step, if it is accepted."""
+    """State after the step if it is accepted, else before it."""
     terms: Float[Array, " k"]
-    """Cost by factor there."""
+    """Cost by factor at `state`."""
     gain: Float[Array, ""]
     """Actual over predicted decrease of the full step."""
     landmark_damping: Float[Array, " l"]
-    """Of landmarks, for the next step."""
+    """Damping of individual landmarks for the next step."""
 
     def next_damping(self, nu: Float[Array, ""]) -> Float[Array, ""]:
-        """Less after a good step, more by `nu` after one that was not accepted."""
+        """Returns the next damping: by Nielsen's factor, or `nu` times if rejected."""
         least = least_damping(self.eliminated.factor.half.dtype)
-        shrink = jnp.maximum(1 - (2 * self.gain - 1) ** 3, SHRINK)
+        shrink = jnp.maximum(1 - (2 * self.gain - 1) ** 3, MIN_DAMPING_FACTOR)
         shrink = jnp.where(self.gain < 0.25, 2.0, shrink)
         lower = jnp.maximum(self.damping * shrink, least)
         return jnp.where(self.accepted, lower, jnp.maximum(self.damping, least) * nu)
@@ -71,11 +71,14 @@ def attempt(
     landmark_damping: Float[Array, " l"],
     last: Bool[Array, ""],
 ) -> Trial:
-    """Solves for a step and tries it; with `last` only factorises, hardly damped."""
+    """Solves for a step and evaluates it; with `last` only
+    factorises, barely damped."""
     damping = jnp.where(last, little(sizes.dtype), damping)
     diagonal = diagonals(lin, sizes)
     extra = damped(
-        diagonal, damping, jnp.where(last, UNSEEN, 1.0).astype(damping.dtype)
+        diagonal,
+        damping,
+        jnp.where(last, UNOBSERVED_DIAGONAL, 1.0).astype(damping.dtype),
     )
     least = jnp.where(last, 0.0, landmark_damping)
     extra["landmarks"] = tuple(
@@ -99,8 +102,10 @@ def attempt(
         problem, state, move.step, slope, predicted, lin.costs
     )
     decrease = jnp.sum(lin.costs) - jnp.sum(terms)
-    accepted = finite & (predicted > 0) & (decrease > GAIN * share * predicted)
-    more = jnp.clip(10 * landmark_damping, *CAUTION)
+    accepted = (
+        finite & (predicted > 0) & (decrease > MIN_GAIN_RATIO * share * predicted)
+    )
+    more = jnp.clip(10 * landmark_damping, *LANDMARK_DAMPING_RANGE)
     after = jnp.where(rejected, more, 0.1 * landmark_damping)
     return Trial(
         eliminated=eliminated,
@@ -117,15 +122,18 @@ def attempt(
 
 
 def least_damping(dtype) -> float:
-    """In double precision far below the stiffness of the softest bend of a long path of
-    cameras, which falls with the fourth power of its length: 1e-10 of a camera's own at
-    1,000 frames. In single precision as little as rounding leaves positive: with a
-    tenth of it every third factorisation fails, and steps are no fewer.
+    """Returns the least damping of a step, which depends on the precision.
+
+    In double precision it is far below the stiffness of the softest bending mode of a
+    long path of cameras, which falls with the fourth power of its length: 1e-10 of a
+    camera's own at 1,000 frames. In single precision it is the least that rounding
+    leaves positive definite: with a tenth of it every third factorisation fails, and
+    there are no fewer steps.
     """
     return 1e-12 if dtype == jnp.float64 else 3e-7
 
 
 def little(dtype) -> float:
-    """Damping that keeps a direction which nothing determines finite, and its variance
-    enormous."""
+    """Returns the damping of the last factorisation, which keeps the variance of an
+    undetermined direction finite, but enormous."""
     return 1e-11 if dtype == jnp.float64 else 1e-6

@@ -13,18 +13,18 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.solver.loops import row_of
 
-LEAF = 12
-"""Width of the blocks, at most."""
+MAX_LEAF_WIDTH = 12
+"""Maximum width of the blocks that are inverted by substitution."""
 
 
 def half_of(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
-    """`L^-1` of positive definite matrices `L L^T`; NaN where one is not."""
+    """Returns `L^-1` of positive definite `L L^T`; NaN where one is not."""
     return invert_lower(cholesky(matrix))
 
 
 def cholesky(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
-    """`L` of positive definite matrices `L L^T`, from their lower triangles; NaN where
-    one is not. On a CPU one after another, as fast as a batch."""
+    """Returns `L` of positive definite matrices `L L^T`, from their lower triangles;
+    NaN where one is not. On a CPU they are factorised in turn, as fast as a batch."""
     one = functools.partial(jnp.linalg.cholesky, symmetrize_input=False)
     if matrix.ndim == 2 or jax.default_backend() != "cpu":
         return one(matrix)
@@ -33,24 +33,25 @@ def cholesky(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
 
 
 def invert_lower(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
-    """Inverse of triangular matrices.
+    """Returns the inverses of lower triangular matrices.
 
-    On a CPU of small blocks down the diagonal first, then of two neighbours at a time,
-    as matrix products are ten times as fast as substitution. Elsewhere by one solve:
-    a GPU waits for each of the many small operations.
+    On a CPU small diagonal blocks are inverted first, then two neighbours are merged at
+    a time, as matrix products are ten times as fast as substitution. Elsewhere it is
+    one
+    solve: a GPU waits for each of many small operations.
     """
     n = lower.shape[-1]
     if jax.default_backend() != "cpu":
         eye = jnp.broadcast_to(jnp.eye(n, dtype=lower.dtype), lower.shape)
         return jax.lax.linalg.triangular_solve(lower, eye, left_side=True, lower=True)
-    levels = max(0, math.ceil(math.log2(n / LEAF)))
+    levels = max(0, math.ceil(math.log2(n / MAX_LEAF_WIDTH)))
     size = -(-n // 2**levels)
     more = size * 2**levels - n
     lower = jnp.pad(lower, [(0, 0)] * (lower.ndim - 2) + [(0, more)] * 2)
     lower = lower + jnp.diag(jnp.arange(n + more) >= n).astype(lower.dtype)
 
     def blocks(shift, step):
-        """Those `shift` below the diagonal, every `step`-th, side by side."""
+        """Returns every `step`-th block, `shift` below the diagonal, side by side."""
         starts = range(0, n + more - shift * size, step * size)
         pick = lambda k: lower[..., k + shift * size :, k:][..., :size, :size]
         return jnp.stack([pick(k) for k in starts], axis=-3)
@@ -67,7 +68,7 @@ def invert_lower(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
 
 
 def _substitute(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
-    """The same, one row after another taken from all below it."""
+    """Inverts by substitution: each row in turn is subtracted from all below it."""
     index = jnp.arange(lower.shape[-1])
 
     def one(k, inverse):

@@ -1,7 +1,7 @@
-"""The error terms of the graph: one file for each kind of measurement.
+"""The factors of the graph, one file for each kind of measurement.
 
-A factor is a subclass of `graph.factor.FrameFactor`, except those of landmarks. Factors
-are created from measurements in `initialisation`: those of people in
+All are subclasses of `graph.factor.FrameFactor`, except those of landmarks. Factors are
+created from measurements in `initialisation`: those of people in
 `people_factors.py`, of the motion model in `motion_factors.py`, of cameras and
 landmarks in `map_factors.py`, of the ground in `scale.py` and of trunks in
 `upright.py`; those of intrinsics in `pipeline/bundle_adjustment.py`.

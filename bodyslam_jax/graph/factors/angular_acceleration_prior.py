@@ -34,7 +34,7 @@ class AngularAccelerationPrior(FrameFactor):
 
     def jacobians(self, state):
         turn, C_HC = self._turns(state)
-        # By a turn of C_k on its right, and of C_{k-1} on its right.
+        # By a rotation on the right of C_k, and of C_{k-1}.
         now = so3.inverse_right_jacobian(turn)
         before = -so3.inverse_right_jacobian(-turn)
         by_root = now, before - previous_frame(now), -previous_frame(before)
@@ -49,7 +49,7 @@ class AngularAccelerationPrior(FrameFactor):
         return self._change(turn) / self.sigma[..., None], parts
 
     def _turns(self, state: State) -> tuple[Float[Array, "h t 3"], Array]:
-        """`Log(C_{k-1}^T C_k)`, and C_HC of each frame."""
+        """Returns `Log(C_{k-1}^T C_k)`, rad, and C_HC of each frame."""
         C_CH = state.roots[..., :3, :3]
         C_WH = state.cameras[:, :3, :3] @ C_CH
         return so3.log(so3.inverse(previous_frame(C_WH)) @ C_WH), so3.inverse(C_CH)
@@ -59,7 +59,7 @@ class AngularAccelerationPrior(FrameFactor):
 
 
 def _shifted_back(x: Array, lag: int) -> Array:
-    """`previous_frame`, so many times."""
+    """Applies `previous_frame` `lag` times."""
     for _ in range(lag):
         x = previous_frame(x)
     return x

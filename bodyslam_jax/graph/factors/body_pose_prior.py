@@ -48,7 +48,7 @@ class BodyPosePrior(FrameFactor):
 
     @property
     def _joint_correlation(self) -> Float[Array, "h t 23"]:
-        """ρ of each joint: 0 where it was not measured in the previous frame."""
+        """Returns ρ of each joint: 0 where not measured in the previous frame."""
         measured = jnp.isfinite(previous_frame(self.sigma))
         return jnp.where(measured, self.correlation[..., None], 0.0)
 
@@ -73,7 +73,7 @@ class BodyPosePrior(FrameFactor):
         return residual, parts
 
     def _innovation(self, error):
-        """The residual, and its coefficients of this frame's and the last error."""
+        """Returns the residual, and the coefficients of both frames' errors in it."""
         rho = self._joint_correlation[..., None]
         # Division by sigma comes last: inf * 0 would make the derivative by ρ NaN.
         now = 1 / jnp.sqrt(1 - rho**2) / self.sigma[..., None]

@@ -22,7 +22,7 @@ class CameraPrior(FrameFactor):
     cameras: Float[Array, "t 4 4"]
     """T̃'_WC: camera to world, its centre in units of the map."""
     sigma: Float[Array, "t 6"]
-    """Of rotation (rad) and of centre (units of the map); `inf` where unknown."""
+    """σ of rotation (rad) and of centre (units of the map); `inf` where unknown."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
     keys = (("camera", 0),)

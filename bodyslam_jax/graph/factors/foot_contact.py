@@ -1,19 +1,19 @@
-"""Points of the feet that carry the person hardly move in the world.
+"""Foot points in contact with the ground hardly move in the world.
 
     r_ki = (q_i(k) - q_i(k-1)) / σ_ki,    q_i = p_W,i - κ r_WH
     p_W,i = r_WH + C_WH p_H,i(θ, β̂),    r_WH = ŝ r'_WC + C_WC r_CH
 
 for toes and heels i, with `σ_ki = σ L(β̂) / sqrt(P_ki P_k-1,i)`: `P` is the probability
-that the point stands (`motion.contact_network`), so that a point that probably swings
-has little weight, and `L` the leg length. In m. A foot rolls, and is rigid in the body
-model, so that its standing points move forward by κ = 3 % of the pelvis' displacement
-(CMU walks: 2.7 ± 0.5 %, runs -2 %).
+of contact (`motion.contact_network`), so that a point that probably swings has little
+weight, and `L` the leg length. In m. A foot rolls, and is rigid in the body model, so
+that its points in contact move forward by κ = 3 % of the pelvis' displacement (CMU
+walks: 2.7 ± 0.5 %, runs -2 %).
 
 Shape β̂ and scale ŝ are constants, those of the optimum without this factor: steps of
-estimated postures err by some per cent, all alike, and thousands of standing points
-would make people or world grow or shrink by as much (2 to 3 % where they are free).
-Default: `weights.contact_sigma` = 0.02 legs at 30 fps, four times the true slip, as it
-is correlated over a stance; Cauchy. Ours.
+estimated postures have a common error of some per cent, and thousands of points in
+contact would make people or world grow or shrink by as much (2 to 3 % where they are
+free). Default: `weights.contact_sigma` = 0.02 legs at 30 fps, four times the true slip,
+as it is correlated over a stance; Cauchy. Ours.
 """
 
 import jax
@@ -28,9 +28,9 @@ from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.pelvis_displacement import previous_frame
 
-SLIP = 0.03
-"""κ: displacement of a standing point as a share of the pelvis'."""
-_FEET = np.array(BODY25_TOES_AND_HEELS)
+SLIP_RATIO = 0.03
+"""κ: displacement of a point in contact as a share of the pelvis'."""
+_TOES_AND_HEELS = np.array(BODY25_TOES_AND_HEELS)
 
 
 class FootContact(FrameFactor):
@@ -42,7 +42,7 @@ class FootContact(FrameFactor):
     scale: Float[Array, "h t"]
     """ŝ, m per unit of the map, the same everywhere."""
     sigma: Float[Array, "h t 4"]
-    """Of a point's displacement from k-1 to k, m; `inf` where it does not stand. Left
+    """σ of a point's displacement from k-1 to k, m; `inf` without contact. Left
     toe, left heel, right toe, right heel."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
@@ -57,9 +57,9 @@ class FootContact(FrameFactor):
     def _points(
         self, frame: Frame, shape: Float[Array, " 10"], scale: Float[Array, ""]
     ) -> Float[Array, "4 3"]:
-        p_H = local_keypoints(self.body, frame.pose, shape, "body25")[_FEET]
-        p_C = p_H @ frame.root[:3, :3].T + (1 - SLIP) * frame.root[:3, 3]
-        eye = (1 - SLIP) * scale * frame.camera[:3, 3]
+        p_H = local_keypoints(self.body, frame.pose, shape, "body25")[_TOES_AND_HEELS]
+        p_C = p_H @ frame.root[:3, :3].T + (1 - SLIP_RATIO) * frame.root[:3, 3]
+        eye = (1 - SLIP_RATIO) * scale * frame.camera[:3, 3]
         return p_C @ frame.camera[:3, :3].T + eye
 
     def jacobians(self, state):
@@ -75,20 +75,22 @@ class FootContact(FrameFactor):
         return (q - previous_frame(q)) / sigma, keys
 
     def _with_derivatives(self, pose, camera, root, shape, scale):
-        """The points q of one frame, m, and their derivatives by its variables."""
+        """Returns the points q of one frame, m, with derivatives by its variables."""
         p_H, by_pose, _ = keypoint_jacobian(
             self.body, pose, shape, "body25", 0.0, BODY25_TOES_AND_HEELS
         )
         C_WC, r_WC = camera[:3, :3], camera[:3, 3]
         C_CH, r_CH = root[:3, :3], root[:3, 3]
         C_WH = C_WC @ C_CH
-        q_C = p_H @ C_CH.T + (1 - SLIP) * r_CH
+        q_C = p_H @ C_CH.T + (1 - SLIP_RATIO) * r_CH
         # C Exp(ω) p = C p + C (ω x p): row i of the derivative is p x (row i of C).
         turned = lambda C, p: jnp.cross(p[:, None], C)
-        wide = lambda C: jnp.broadcast_to((1 - SLIP) * C, (len(_FEET), 3, 3))
+        wide = lambda C: jnp.broadcast_to(
+            (1 - SLIP_RATIO) * C, (len(_TOES_AND_HEELS), 3, 3)
+        )
         eye = jnp.eye(3, dtype=pose.dtype)
         join = lambda *parts: jnp.concatenate(parts, axis=-1)
-        return q_C @ C_WC.T + (1 - SLIP) * scale * r_WC, {
+        return q_C @ C_WC.T + (1 - SLIP_RATIO) * scale * r_WC, {
             "camera": join(turned(C_WC, q_C), wide(scale * eye)),
             "root": join(turned(C_WH, p_H), wide(C_WC)),
             "pose": jnp.einsum("ij,jfm->fim", C_WH, by_pose),

@@ -1,11 +1,12 @@
 """People stand on the ground of the map.
 
-    r = (n^T (s r'_WC + C_WC p_C) + s d - SOLE) / σ
+    r = (n^T (s r'_WC + C_WC p_C) + s d - SOLE_HEIGHT_M) / σ
 
 In m. `n^T x' + d = 0` is the ground among the landmarks, in units of the map: one
-plane, or, where the ground is not a plane, level ground of another height d under each
-person in each frame. `p_C` is the soft minimum, along n, of heels and toes. It relates
-metres of the body to units of the map, so scale is observable even where nobody walks.
+plane, or, where the ground is not a plane, level ground of a different height d under
+each person in each frame. `p_C` is the soft minimum, along n, of heels and toes. It
+relates metres of the body to units of the map, so scale is observable even where nobody
+walks.
 Default: `weights.ground_sigma` = 0.04 m, one error for the whole sequence: times the
 root of the number of frames. Ours.
 """
@@ -23,14 +24,14 @@ from bodyslam_jax.graph.state import State
 
 HEELS_AND_TOES = (19, 21, 22, 24)
 """Big toe and heel among the keypoints of BODY_25, left and right."""
-SOLE = 0.018
+SOLE_HEIGHT_M = 0.018
 """Height of those keypoints above the sole, m."""
-_SOFTNESS = 0.01
-"""Of the soft minimum: a point this much higher has e times less weight, m."""
+_SOFTNESS_M = 0.01
+"""Softness of the minimum, m: a point this much higher has 1/e of the weight."""
 
 
 class GroundContact(FrameFactor):
-    """`r = (height of the lowest point of the feet above the plane - SOLE) / σ`."""
+    """`r = (height of the lowest point of the feet - SOLE_HEIGHT_M) / σ`."""
 
     body: BodyModel
     normal: Float[Array, " 3"]
@@ -47,7 +48,7 @@ class GroundContact(FrameFactor):
 
     def frame_residual(self, data, window, shared):
         (offset, sigma), (frame,) = data, window
-        return (self._lowest(frame, shared, offset) - SOLE)[None] / sigma
+        return (self._lowest(frame, shared, offset) - SOLE_HEIGHT_M)[None] / sigma
 
     def jacobian(self, data, window, shared):
         (offset, sigma), (frame,) = data, window
@@ -55,7 +56,7 @@ class GroundContact(FrameFactor):
             self.body, frame.pose, shared.shape, "body25", 0.0, HEELS_AND_TOES
         )
         height, up_C = self._heights(p_H, frame, shared, offset)
-        share = jax.nn.softmax(-height / _SOFTNESS)
+        share = jax.nn.softmax(-height / _SOFTNESS_M)
         up_H = frame.root[:3, :3].T @ up_C
         at_H = share @ p_H
         at_C = frame.root[:3, :3] @ at_H + frame.root[:3, 3]
@@ -71,19 +72,21 @@ class GroundContact(FrameFactor):
             ("shape", 0): jnp.einsum("f,i,fib->b", share, up_H, by_shape),
         }
         parts = {key: part[None] / sigma for key, part in parts.items()}
-        return (_soft_minimum(height) - SOLE)[None] / sigma, parts
+        return (_soft_minimum(height) - SOLE_HEIGHT_M)[None] / sigma, parts
 
     def scales(self, state: State) -> Float[Array, "h t"]:
-        """The s that would put the feet on the ground, for each person and frame."""
+        """Returns the s that puts the feet on the ground, for each person and frame."""
         return self.map_frames(self._scale, state)
 
     def _scale(self, data, window, shared, _):
         (offset, _), (frame,) = data, window
         eye = self.normal @ frame.camera[:3, 3] + offset
-        return (shared.scale * eye - self._lowest(frame, shared, offset) + SOLE) / eye
+        return (
+            shared.scale * eye - self._lowest(frame, shared, offset) + SOLE_HEIGHT_M
+        ) / eye
 
     def soles(self, state: State) -> Float[Array, "h t 3"]:
-        """The lowest point of the feet, on the sole, in the camera frame, m."""
+        """Returns the lowest point of the soles in the camera frame, m."""
         return self.map_frames(self._sole, state)
 
     def _sole(self, data, window, shared, _):
@@ -91,8 +94,8 @@ class GroundContact(FrameFactor):
         p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")
         p_H = p_H[np.array(HEELS_AND_TOES)]
         height, up_C = self._heights(p_H, frame, shared, offset)
-        at_H = jax.nn.softmax(-height / _SOFTNESS) @ p_H
-        return frame.root[:3, :3] @ at_H + frame.root[:3, 3] - SOLE * up_C
+        at_H = jax.nn.softmax(-height / _SOFTNESS_M) @ p_H
+        return frame.root[:3, :3] @ at_H + frame.root[:3, 3] - SOLE_HEIGHT_M * up_C
 
     def _lowest(self, frame, shared, offset):
         p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")
@@ -100,7 +103,7 @@ class GroundContact(FrameFactor):
         return _soft_minimum(height)
 
     def _heights(self, p_H, frame, shared, offset):
-        """Heights of points above the ground, m, and the ground's normal in C."""
+        """Returns heights of points above the ground, m, and its normal in C."""
         up_C = frame.camera[:3, :3].T @ self.normal
         p_C = p_H @ frame.root[:3, :3].T + frame.root[:3, 3]
         eye = shared.scale * (self.normal @ frame.camera[:3, 3] + offset)
@@ -108,4 +111,4 @@ class GroundContact(FrameFactor):
 
 
 def _soft_minimum(height: Float[Array, " f"]) -> Float[Array, ""]:
-    return -_SOFTNESS * jax.nn.logsumexp(-height / _SOFTNESS)
+    return -_SOFTNESS_M * jax.nn.logsumexp(-height / _SOFTNESS_M)

@@ -1,4 +1,4 @@
-"""People move as the motion model predicts (e_mm, section 3.6 of the paper).
+"""The displacement that the motion model predicts (e_mm, section 3.6 of the paper).
 
     e_k = C_WH,k-1^T (r_WH,k - r_WH,k-1) / L - r̃_k,    r_WH = s r'_WC + C_WC r_CH
     r_k = W_k (e_k - ρ e_{k-1}) / sqrt(1 - ρ²),        W^T W = Σ^-1
@@ -101,7 +101,7 @@ class HumanMotion(FrameFactor):
 
 
 def unit_length(body: BodyModel | None, shared: Shared) -> Float[Array, ""]:
-    """The length of the person's leg, m; 1 m without a body."""
+    """Returns the length of the person's leg, m; 1 m without a body."""
     if body is None:
         return jnp.ones_like(shared.scale)
     return leg_length(body, shared.shape)

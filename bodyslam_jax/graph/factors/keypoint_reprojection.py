@@ -85,7 +85,7 @@ class KeypointReprojection(FrameFactor):
     def curvature(
         self, state: State
     ) -> tuple[Float[Array, "h t 72 72"], Float[Array, "h t 72 10"]]:
-        """The second-order term of the Hessian, `Σ w r^T ∂²r`: by rotations of root and
+        """Returns the second-order term `Σ w r^T ∂²r`: by rotations of root and
         joints (72, rad) twice, and by those and shape.
 
         Weights of the loss are constants, as in the solver. Second derivatives of the

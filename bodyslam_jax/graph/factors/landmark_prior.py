@@ -3,10 +3,10 @@
     r = W (l - l̃),    W^T W = Σ^-1
 
 A point that is lost and found again becomes several landmarks, each observed in a short
-run of frames, so that the reduced camera matrix stays banded. What their observations
-know of each other enters as a prior on each, which is how loop closures constrain the
-map. `l̃` and `Σ` come from structure from motion (`sfm/loop_closure.py`), in units of
-the map, with the same pixel noise as `Reprojection` (`weights.pixel_sigma`). Ours.
+run of frames, so that the reduced camera matrix stays banded. Each has a prior from the
+observations of the others, which is how loop closures constrain the map. `l̃` and `Σ`
+come from structure from motion (`sfm/loop_closure.py`), in units of the map, with the
+same pixel noise as `Reprojection` (`weights.pixel_sigma`). Ours.
 """
 
 import jax.numpy as jnp

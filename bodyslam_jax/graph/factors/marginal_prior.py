@@ -1,22 +1,21 @@
-"""What measurements that are gone said of the states that stay.
+"""The information of marginalised measurements on the remaining variables.
 
     r = W (x ⊖ x̂) + b,    W^T W = Λ,  W^T b = η
 
 `solver.marginalise` makes it of the first frames of a problem: `½ δ^T Λ δ + η^T δ` is,
-up to a constant, the least cost of their measurements over the variables that have
-left, for a step δ from x̂, where they were linearised. `⊖` is `State.local`. W keeps the
+up to a constant, the least cost of their measurements over the eliminated variables,
+for a step δ from x̂, where they were linearised. `⊖` is `State.local`. W keeps the
 derivatives at these first estimates; the chart x ⊖ x̂ is that of x̂, too, so that the
-cost is one function of the state, and its derivatives are its own.
+cost is one function of the state, with derivatives of its own.
 
-Where the measurements did not depend on where the map is, how it is turned, or on its
-unit, neither does r, at any state: x is first moved, turned and scaled as a whole so
-that a camera of the prior is where it was at x̂, and the others as far from it. Other
-factors may therefore be linearised anywhere, and no direction that nothing measured
-gains information, which is what first estimates in all Jacobians are for otherwise
-(Huang, Mourikis, Roumeliotis, A first-estimates Jacobian EKF, 2008). What a named
-global of the world, such as the direction of gravity, has to turn with the map is not
-known here: if the measurements depended on one, the prior keeps to the directions that
-they left free at x̂, to first order. Ours.
+Where the measurements were invariant to translation, rotation or scale of the map, so
+is r, at any state: x is first aligned as a whole, so that a camera of the prior is
+where it was at x̂, and the others at the same distances. Other factors may therefore be
+linearised anywhere, and unobservable directions gain no information, which otherwise
+takes first estimates in all Jacobians (Huang, Mourikis, Roumeliotis, A first-estimates
+Jacobian EKF, 2008). How a named global of the world, such as the direction of gravity,
+rotates with the map is not known here: if the measurements depended on one, the prior
+is invariant along the directions that they left free at x̂, to first order. Ours.
 """
 
 import dataclasses
@@ -31,7 +30,7 @@ from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.state import State, Step
 
-_LAST = CHUNK - 1
+_LAST_FRAME = CHUNK - 1
 """The frame whose postures are in the prior."""
 
 
@@ -39,10 +38,10 @@ class MarginalPrior(Factor):
     """`r = W (x ⊖ x̂) + b` of the first frames of a problem: one measurement of `n`
     coordinates.
 
-    Frames of the first chunk are the past. In the prior are, of these, the last
-    postures and the last roots and cameras, as many as factors reach back to; all
-    further cameras up to the last of `estimate`; and scale, intrinsics, named globals
-    and shapes. Coordinates stand in that of `coordinates`.
+    Frames of the first chunk are the past. The prior is on their last posture, and on
+    their last roots and cameras, as many as factors reach back to; on all further
+    cameras up to the last of `estimate`; and on scale, intrinsics, named globals and
+    shapes. Coordinates are in the order of `coordinates`.
     """
 
     root: Float[Array, "n n"]
@@ -55,8 +54,8 @@ class MarginalPrior(Factor):
     anchor: Float[Array, " c"]
     """1 for the cameras whose centres the measurements depended on."""
     invariant: Float[Array, " 3"]
-    """1 where they did not depend on where the map is, on how it is turned, and on its
-    unit; the last two only with the first."""
+    """1 where they were invariant to translation, rotation and scale of the map; the
+    last two only with the first."""
     reach: int = eqx.field(static=True)
     """Number of roots."""
     loss: Loss = Squared()
@@ -64,18 +63,18 @@ class MarginalPrior(Factor):
 
     @property
     def frames(self) -> int:
-        """How many frames it looks at, the first ones."""
+        """Returns the number of frames that it depends on, the first ones."""
         return len(self.estimate.cameras)
 
     def residual(self, state: State) -> Float[Array, " n"]:
         return self.root @ self.moved(self.first_frames(state)) + self.offset
 
     def moved(self, first: State) -> Float[Array, " n"]:
-        """`x ⊖ x̂`, of the first frames of a state."""
+        """Returns `x ⊖ x̂` of the first frames of a state."""
         return coordinates(self.estimate.local(self._aligned(first)), self.reach)
 
     def first_frames(self, x: Any) -> Any:
-        """A state, or a step, of the frames that it looks at, without landmarks."""
+        """Restricts a state, or a step, to the prior's frames, without landmarks."""
         c = self.frames
         return dataclasses.replace(
             x,
@@ -102,8 +101,8 @@ class MarginalPrior(Factor):
         return dataclasses.replace(self, root=root, estimate=estimate)
 
     def _aligned(self, first: State) -> State:
-        """The state moved, turned and scaled as a whole, as far as nothing depended on
-        that, so that the first camera of `anchor` is where it was."""
+        """Returns the state translated, rotated and scaled as a whole, as far as the
+        prior is invariant to that, with the first camera of `anchor` as in x̂."""
         moves, turns, scales = self.invariant
         at = jnp.argmax(self.anchor)
         here, there = first.cameras, self.estimate.cameras
@@ -121,17 +120,17 @@ class MarginalPrior(Factor):
         return dataclasses.replace(first, scale=first.scale / ratio, cameras=cameras)
 
     def _size(self, r: Float[Array, "c 3"], at: Array) -> Float[Array, ""]:
-        """Squared distances of the cameras from the first."""
+        """Returns the sum of squared distances of the cameras to that at `at`."""
         return jnp.sum(self.anchor[:, None] * (r - r[at]) ** 2)
 
 
 def coordinates(step: Step, reach: int) -> Float[Array, " n"]:
-    """What of a step of the first frames stands in a prior: scale, intrinsics, named
+    """Returns the coordinates of a step that a prior has: scale, intrinsics, named
     globals, shapes, cameras, the last roots and the last postures of the first chunk.
     """
     parts = (
         *(step.scale[None], step.intrinsics, step.globals, step.shapes, step.cameras),
-        *(step.roots[:, CHUNK - reach : CHUNK], step.poses[:, _LAST]),
+        *(step.roots[:, CHUNK - reach : CHUNK], step.poses[:, _LAST_FRAME]),
     )
     return jnp.concatenate([part.reshape(-1) for part in parts])
 

@@ -1,4 +1,4 @@
-"""The person turns as the motion model predicts.
+"""The turn of the person that the motion model predicts.
 
     r = Log(C̃_k^T C_WH,k-1^T C_WH,k) / σ
 

@@ -24,7 +24,7 @@ class Reprojection(Factor):
     landmark: Int[Array, " m"]
     pixel: Float[Array, "m 2"]
     sigma: Float[Array, " m"]
-    """Of each pixel coordinate, px; `inf` where rejected or missing."""
+    """σ of each pixel coordinate, px; `inf` where rejected or missing."""
     loss: Loss
 
     def residual(self, state: State) -> Float[Array, "m 2"]:

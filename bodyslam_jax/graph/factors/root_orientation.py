@@ -62,7 +62,7 @@ class RootOrientation(FrameFactor):
 
     @property
     def _coefficients(self):
-        """Of this frame's and the last error in the residual."""
+        """Returns the coefficients of both frames' errors in the residual."""
         rho = self.correlation[..., None]
         # Division by sigma comes last: inf * 0 would make the derivative by ρ NaN.
         now = 1 / jnp.sqrt(1 - rho**2) / self.sigma[..., None]

@@ -51,7 +51,7 @@ class RootPositionPrior(FrameFactor):
 def _relative_error(
     measured: Float[Array, " 3"], position: Float[Array, " 3"]
 ) -> Float[Array, " 3"]:
-    """Errors of direction (2) and of depth, as shares of the measured depth."""
+    """Returns errors of direction (2) and depth, as shares of the measured depth."""
     share = position / measured[2]
     direction = share[:2] - measured[:2] / measured[2] * share[2]
     return jnp.append(direction, share[2] - 1)

@@ -1,9 +1,9 @@
-"""Eliminates what a person has within a chunk: postures but the last, roots but the
-last ones.
+"""Eliminates the inner variables of a person in a chunk: all but the last posture and
+the last roots.
 
-Chunks are worked on a group at a time, so that what they need stays in the processor's
-cache: first the postures (`elimination/pose_chain.py`), then the roots all at once.
-What is left couples the last posture and roots of a chunk with those of the chunk
+Chunks are eliminated a group at a time, so that their blocks stay in the processor's
+cache: first the postures (`elimination/pose_chain.py`), then the roots all at once. The
+Schur complement couples the last posture and roots of a chunk with those of the chunk
 before, with the cameras of both, and with the globals.
 """
 
@@ -22,7 +22,7 @@ from bodyslam_jax.solver.elimination.pose_chain import (
     substitute_postures,
 )
 from bodyslam_jax.solver.front import (
-    KEPT,
+    KEPT_GROUPS,
     Pairs,
     Window,
     add_pairs,
@@ -31,32 +31,32 @@ from bodyslam_jax.solver.front import (
 )
 from bodyslam_jax.solver.triangular import half_of
 
-GROUP = 16
-"""Chunks eliminated together, at most."""
+MAX_GROUP_CHUNKS = 16
+"""Maximum number of chunks that are eliminated together."""
 
 
 class RootFactor(eqx.Module):
-    """The factor of inner roots: `L^-1` of their pivot, and of their coupling with the
-    kept groups, transposed; its last row is the right-hand side's."""
+    """The factor of inner roots: `L^-1` of their pivot, and `L^-1` times their coupling
+    with the kept groups, transposed; its last row is the right-hand side's."""
 
     half: Float[Array, "*n m m"]
     side: Float[Array, "*n k m"]
 
 
 class People(eqx.Module):
-    """What elimination leaves, and what back-substitution needs."""
+    """The Schur complement of the elimination, and what back-substitution needs."""
 
     postures: Postures | None
-    """Leading axes `h n`."""
+    """Factors of inner postures; leading axes `h n`."""
     roots: RootFactor
     kept: Float[Array, "*n k k"]
-    """Between the groups `KEPT` of each chunk's window."""
+    """Schur complement on the groups `KEPT_GROUPS` of each chunk's window."""
 
 
 def eliminate_people(
     lin: Linearisation, sizes: Sizes, window: Window, damping: dict[str, Array]
 ) -> People:
-    """Eliminates inner postures and roots of all people; `damping` joins diagonals."""
+    """Eliminates inner postures and roots of all people, damped."""
     h, n = sizes.people, sizes.chunks
     terms = _terms(lin, sizes, window, damping["root"])
     chain = posture_blocks(lin, damping["pose"]) if window.pose else None
@@ -72,8 +72,10 @@ def eliminate_people(
             postures, left = eliminate_postures(window, *chain)
             pairs = add_pairs(left, pairs)
         half = half_of(matrix_of(window, pairs, ("inner",), ("inner",)))
-        side = matrix_of(window, pairs, KEPT, ("inner",)) @ half.swapaxes(-1, -2)
-        kept = matrix_of(window, pairs, KEPT, KEPT) - side @ side.swapaxes(-1, -2)
+        side = matrix_of(window, pairs, KEPT_GROUPS, ("inner",)) @ half.swapaxes(-1, -2)
+        kept = matrix_of(
+            window, pairs, KEPT_GROUPS, KEPT_GROUPS
+        ) - side @ side.swapaxes(-1, -2)
         return People(postures, RootFactor(half, side), kept)
 
     found = jax.lax.map(group, given)
@@ -81,19 +83,19 @@ def eliminate_people(
 
 
 def group_size(count: int) -> int:
-    """How many chunks are eliminated together: enough that small steps do not wait for
-    each other, few enough that what they work on stays in the processor's cache. On
-    a GPU all of them."""
+    """Returns how many of `count` chunks are eliminated together, a divisor of it:
+    enough that small operations do not wait for each other, few enough that their
+    blocks stay in the processor's cache. On a GPU all of them are."""
     if jax.default_backend() != "cpu":
         return count
-    return max(size for size in range(1, GROUP + 1) if count % size == 0)
+    return max(size for size in range(1, MAX_GROUP_CHUNKS + 1) if count % size == 0)
 
 
 def _terms(
     lin: Linearisation, sizes: Sizes, window: Window, damping: Float[Array, "h t 6"]
 ) -> Pairs:
-    """Blocks of roots with roots, cameras and globals, of each chunk's window. A term
-    belongs to the chunk of its latest frame."""
+    """Returns the blocks of roots with roots, cameras and globals in each chunk's
+    window. A term belongs to the chunk of its latest frame."""
     h, n, reach = sizes.people, sizes.chunks, window.reach
     cut = lambda x: x.reshape(h, n, CHUNK, *x.shape[2:])
     turned = lambda x: x.swapaxes(-1, -2)
@@ -153,8 +155,8 @@ def substitute_people(
     cameras: Float[Array, "t 6"],
     own_globals: Float[Array, "h g"],
 ) -> tuple[Float[Array, "h t 6"], Float[Array, "h t c"] | None]:
-    """Steps of all roots and postures, from what each person keeps of the chunks, from
-    those of cameras and of the person's globals."""
+    """Returns the steps of all roots and postures, given those of each chunk's last
+    posture and roots, of the cameras, and of each person's globals."""
     h, n = sizes.people, sizes.chunks
     last = 6 * window.reach
     of_chunks = jnp.broadcast_to(cameras.reshape(1, n, -1), (h, n, 6 * CHUNK))
@@ -177,7 +179,7 @@ def substitute_people(
         "roots": steps[..., pose:],
         "old_cameras": old_cameras,
         "cameras": of_chunks,
-        # -1 for the right-hand side: whole tables, without a copy of a part.
+        # A factor of -1 for the right-hand side saves copying parts of the tables.
         "common": jnp.concatenate([common, -jnp.ones_like(common[..., :1])], axis=-1),
     }
     border = jnp.concatenate([values[name] for name in border_of(window)], axis=-1)

@@ -1,10 +1,11 @@
 """Eliminates postures: a chain in time, cut into chunks that are eliminated together.
 
-Inside a chunk of B frames the postures of all frames but the last go, frame after
-frame, the same step in all chunks and people at once. What they leave couples the
-border of the chunk (`front.py`). The roots of later frames have no part in the first
-frames: these go with fewer columns. Border columns are stored as rows, one after
-another in memory, as products of these are half as fast again. Exact.
+Inside a chunk of B frames the postures of all frames but the last are eliminated, frame
+after frame, the same step in all chunks and people at once. Their Schur complement
+couples the border of the chunk (`front.py`). The border columns of later roots are
+structurally zero in the first frames, and left out there. Border columns are stored as
+rows, contiguous in memory, which makes their products half as fast again. The
+elimination is exact.
 """
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from bodyslam_jax.solver.triangular import half_of
 
 
 class Postures(eqx.Module):
-    """What elimination leaves of the first `e = B - 1` postures of each chunk, for
+    """The factors of the first `e = B - 1` postures of each chunk, for
     back-substitution."""
 
     half: Float[Array, "*n e p p"]
@@ -32,7 +33,7 @@ class Postures(eqx.Module):
 
 
 def border_of(window: Window) -> tuple[str, ...]:
-    """The groups that inner postures of a chunk touch, once they are eliminated."""
+    """Returns the groups that the Schur complement of inner postures couples."""
     if window.cross:
         between = "old_roots", "inner", "roots", "old_cameras", "cameras"
     else:
@@ -41,8 +42,8 @@ def border_of(window: Window) -> tuple[str, ...]:
 
 
 def phases_of(window: Window) -> tuple[tuple[int, int, int], ...]:
-    """Frames from one up to another, and how many columns at the end of the border
-    they do not touch: roots of later frames."""
+    """Returns, for each phase, its first frame, its end, and the number of columns at
+    the end of the border, of later roots, that are structurally zero in it."""
     if window.cross:
         return ((0, CHUNK - 1, 0),)
     middle = CHUNK // 2
@@ -50,7 +51,7 @@ def phases_of(window: Window) -> tuple[tuple[int, int, int], ...]:
 
 
 def posture_blocks(lin: Linearisation, damping: Float[Array, "h t p"]) -> tuple:
-    """What `eliminate_postures` takes, of all frames; leading axes `h t`."""
+    """Returns the arguments of `eliminate_postures`; leading axes `h t`."""
     blocks = {k: v for k, v in lin.blocks.items() if k[0] == "pose"}
     return blocks, lin.gradient["pose"], damping
 
@@ -60,7 +61,7 @@ def eliminate_postures(
 ) -> tuple[Postures, Pairs]:
     """Eliminates all postures but the last of each of `g` chunks, at the same time.
 
-    Returns what they leave on pairs of the window's groups, too.
+    Returns their factors, and their Schur complement on pairs of the window's groups.
     """
     p, dtype = window.pose, damping.dtype
     eye = jnp.eye(p, dtype=dtype)
@@ -97,8 +98,8 @@ def eliminate_postures(
 
 
 def _squares(parts: list[Float[Array, "g _b _e p"]]) -> Float[Array, "g b b"]:
-    """Products of rows with each other, added up; the first parts lack rows at the end,
-    which are 0 there."""
+    """Returns the sum of all parts' products of rows with each other; rows that the
+    first parts lack at the end count as 0."""
     size = parts[-1].shape[1]
     total = jnp.zeros((), parts[-1].dtype)
     for part in parts:
@@ -114,8 +115,8 @@ def _left(
     rows: Float[Array, "g b p"],
     update: Float[Array, "g b b"],
 ) -> Pairs:
-    """What is left on pairs of groups, from the pivot and the rows of the last posture
-    and from what the others take from the border."""
+    """Returns the Schur complement on pairs of groups, from the pivot and the rows of
+    the last posture and from the `update` of the border by the others."""
     slices = window.slices(border_of(window))
     left = {("sep", "sep"): pivot}
     names = list(slices)
@@ -127,8 +128,8 @@ def _left(
 
 
 def _rows(window: Window, blocks: dict, gradient: Array, k) -> Float[Array, "g b p"]:
-    """Blocks of frame k of each chunk against the border; of the posture before it,
-    only frame 0 knows."""
+    """Returns the blocks of frame k of each chunk against the border, with zeros for
+    the last posture of the chunk before, which only frame 0 couples with."""
     at = lambda x: row_of(x, k, 1)
     dtype, g, p = gradient.dtype, len(gradient), window.pose
     reach = window.reach if window.cross else 0
@@ -143,7 +144,7 @@ def _rows(window: Window, blocks: dict, gradient: Array, k) -> Float[Array, "g b
         for lag in (-1, 0, 1):
             block = blocks.get(("pose", name, lag))
             if block is not None:
-                # Frame k against frame k - lag.
+                # The block couples frame k with frame k - lag.
                 place = jnp.eye(CHUNK, CHUNK + reach, k=reach - lag, dtype=dtype)
                 place = row_of(place, k)
                 wide = at(block).swapaxes(-1, -2)[:, None] * place[:, None, None]
@@ -157,8 +158,8 @@ def substitute_postures(
     border_step: Float[Array, "g b"],
     last: Float[Array, "g p"],
 ) -> Float[Array, "g B p"]:
-    """Steps of all postures of chunks from those of the border (-1 for the right-hand
-    side) and of their last postures."""
+    """Returns the steps of all postures of chunks, given those of the border (-1 for
+    the right-hand side) and of their last postures."""
     half, link = postures.half, postures.link
     right = []
     for solved in postures.solved:

@@ -20,8 +20,8 @@ from bodyslam_jax.solver.loops import scan_used
 
 
 class ReducedCameras(eqx.Module):
-    """What landmarks leave on `n` chunks of cameras (as they stand), and on
-    intrinsics."""
+    """The (negative) updates of `n` chunks of cameras, as they stand, and of intrinsics
+    by the elimination of landmarks."""
 
     band: Float[Array, "n c w"]
     """Row chunk against itself and the next ones, `c = 6 B`, `w = bandwidth * c`."""
@@ -33,7 +33,7 @@ class ReducedCameras(eqx.Module):
 
 
 def half_inverse(blocks: LandmarkBlocks, damping: Float[Array, "n 3 g"]) -> list[list]:
-    """`L^-1` of each landmark's damped 3 x 3 block, as rows of arrays `n g`."""
+    """Returns `L^-1` of each landmark's damped 3 x 3 block, as rows of arrays `n g`."""
     v = lambda i, j: blocks.own[:, i, j] + (damping[:, i] if i == j else 0.0)
     l00 = jnp.sqrt(v(0, 0))
     l10, l20 = v(1, 0) / l00, v(2, 0) / l00
@@ -53,8 +53,8 @@ def eliminate_landmarks(
     damping: tuple[Array, ...],
     sizes: Sizes,
 ) -> ReducedCameras:
-    """Sums what all groups take away, to be added to the cameras' own blocks; lasting
-    landmarks stay."""
+    """Sums the (negative) updates of all groups of landmarks, to be added to the
+    cameras' own blocks. Lasting landmarks are not eliminated here."""
     dtype = sizes.dtype
     n, count = sizes.chunks, sizes.intrinsics
     band = jnp.zeros((n, CAMERAS, sizes.bandwidth * CAMERAS), dtype)
@@ -121,8 +121,8 @@ def substitute_landmarks(
     intrinsics: Float[Array, " i"],
     out: Float[Array, "l 3"],
 ) -> Float[Array, "l 3"]:
-    """Steps of the landmarks from those of cameras, as their chunks stand, and of
-    intrinsics, into `out`; but for lasting ones."""
+    """Returns `out` with the steps of all but lasting landmarks, given those of
+    cameras, as their chunks stand, and of intrinsics."""
     for bucket, table, damp in zip(
         problem.layout.buckets, tables, damping, strict=True
     ):
@@ -130,7 +130,7 @@ def substitute_landmarks(
             continue
         step = cameras[frames_of(bucket.first_chunk, bucket.width)]
         n, g = len(step), table.own.shape[-1]
-        # In the order that the tables have: `einsum` would have them in another first.
+        # A product in the order of the tables, which `einsum` would transpose first.
         taken = step.reshape(n, 1, -1) @ table.cross.reshape(n, -1, 3 * g)
         right = -table.gradient - taken.reshape(n, 3, g)
         right = right - jnp.einsum("nibg,i->nbg", table.cross_intrinsics, intrinsics)
@@ -140,7 +140,7 @@ def substitute_landmarks(
 
 
 def solve_landmarks(half: list[list], right: Float[Array, "n 3 g"]) -> Array:
-    """`L^-T L^-1` times a right-hand side of each landmark."""
+    """Returns `L^-T L^-1` times a right-hand side of each landmark."""
     forward = [sum(half[i][k] * right[:, k] for k in range(i + 1)) for i in range(3)]
     back = [sum(half[k][i] * forward[k] for k in range(i, 3)) for i in range(3)]
     return jnp.stack(back, axis=1)

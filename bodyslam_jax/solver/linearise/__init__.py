@@ -30,7 +30,7 @@ def linearise(
     state: State,
     dtype: np.dtype | None = None,
 ) -> Linearisation:
-    """All blocks at a state; held coordinates have zero rows and columns.
+    """Returns all blocks at a state; held coordinates have zero rows and columns.
 
     Blocks are kept in `dtype`, gradients and costs in the state's own.
     """

@@ -21,8 +21,8 @@ from bodyslam_jax.graph import (
 from bodyslam_jax.solver.blocks import Sums, shifted
 from bodyslam_jax.solver.posture import basis_of, to_coordinates
 
-_RANK = {"pose": 0, "root": 1, "camera": 2, "globals": 3}
-_GROUP = {
+_VARIABLE_ORDER = {"pose": 0, "root": 1, "camera": 2, "globals": 3}
+_GROUP_OF_VARIABLE = {
     "pose": "poses",
     "root": "roots",
     "camera": "cameras",
@@ -31,15 +31,15 @@ _GROUP = {
     "intrinsics": "intrinsics",
     "globals": "globals",
 }
-_LOCAL = ("pose", "root", "camera")
-_COMMON = ("scale", "intrinsics", "globals", "shape")
+_FRAME_VARIABLES = ("pose", "root", "camera")
+_GLOBAL_VARIABLES = ("scale", "intrinsics", "globals", "shape")
 
 
 def linearise_frames(
     problem: Problem, factor: FrameFactor, state: State, sums: Sums
 ) -> None:
     """Adds all blocks of one factor to `sums`; held coordinates have zeros."""
-    keys = [t for t in factor.touched if _GROUP[t[0]] in problem.variables]
+    keys = [t for t in factor.touched if _GROUP_OF_VARIABLE[t[0]] in problem.variables]
     if not keys:
         sums.costs.append(factor.cost(state))
         return
@@ -50,11 +50,14 @@ def linearise_frames(
     if not factor.of_people:
         residual, root_weight = residual[None], root_weight[None]
         parts = {touch: part[None] for touch, part in parts.items()}
-    # The rows of a frame in one axis.
+    # All residuals of a frame are flattened to one axis of rows.
     lead = residual.shape[:2]
     rows = lambda x, *width: x.reshape(*lead, -1, *width)
     weight = rows(jnp.broadcast_to(root_weight, residual.shape), 1)
-    local = sorted((t for t in keys if t[0] in _LOCAL), key=lambda t: _RANK[t[0]])
+    local = sorted(
+        (t for t in keys if t[0] in _FRAME_VARIABLES),
+        key=lambda t: _VARIABLE_ORDER[t[0]],
+    )
     columns = []
     for name, lag in local:
         free = _free_of(problem, name, lag)
@@ -66,10 +69,10 @@ def linearise_frames(
         else:
             part = rows(part, TURNS) * free[..., None, :]
             columns.append(to_coordinates(problem, part))
-    common = [name for name in _COMMON if (name, 0) in keys]
+    common = [name for name in _GLOBAL_VARIABLES if (name, 0) in keys]
     if common:
         widths = _common_widths(sums.sizes)
-        for name in _COMMON:
+        for name in _GLOBAL_VARIABLES:
             if name in common:
                 free = _free_of_shared(problem, name, factor.of_people)
                 columns.append(rows(parts[name, 0], widths[name]) * free)
@@ -80,7 +83,7 @@ def linearise_frames(
 
 
 def _of_joints(problem, rows, part, free):
-    """By coordinates of postures, where row j depends on joint j alone."""
+    """Returns derivatives by posture coordinates, where row j sees joint j only."""
     part = part.reshape(*part.shape[:3], -1, 3) * free.reshape(*part.shape[:3], 1, 3)
     basis = basis_of(problem, part.dtype).reshape(23, 3, -1)
     wide = jnp.einsum("htjda,jak->htjdk", part, basis)
@@ -88,12 +91,12 @@ def _of_joints(problem, rows, part, free):
 
 
 def _derivatives(factor, keys, state, sums):
-    """The residual of all frames, and its derivative by each of the touches."""
+    """Returns the residual of all frames, and its derivatives by variable and lag."""
     known = factor.jacobians(state)
     if known is not None:
         return known
-    local = [t for t in keys if t[0] in _LOCAL]
-    common = [t for t in keys if t[0] not in _LOCAL]
+    local = [t for t in keys if t[0] in _FRAME_VARIABLES]
+    common = [t for t in keys if t[0] not in _FRAME_VARIABLES]
     width = {"pose": 3 if factor.per_joint else 69, "root": 6, "camera": 6}
     width |= _common_widths(sums.sizes)
     ordered = [*local, *common]
@@ -132,7 +135,7 @@ def _derivatives(factor, keys, state, sums):
 
 
 def _common_widths(sizes):
-    """Coordinates of each group of globals."""
+    """Returns the number of coordinates of each group of globals."""
     named = {"intrinsics": sizes.intrinsics, "globals": sizes.named}
     return {"scale": 1, **named, "shape": 10}
 
@@ -148,7 +151,7 @@ def _add_products(sums, local, has_common, columns, weight, factor):
         slope = gram[..., -1, :]
     else:
         slope = jnp.einsum("...ra,...r->...a", whole, whole[..., -1])
-    # A term of frame k about frame k - lag.
+    # Blocks of row k that belong to a variable of frame k - lag are moved there.
     shift = lambda x, lag: shifted(x, -lag, 1)
     spread = slice(ends[len(local) - 1] if local else 0, ends[-2] if has_common else 0)
     squeeze = (lambda x: x) if of_people else (lambda x: x[0])
@@ -156,7 +159,10 @@ def _add_products(sums, local, has_common, columns, weight, factor):
         own = shift(slope[..., parts[i]], lag)
         sums.add_gradient(name if of_people else "camera_alone", squeeze(own))
         for j, (other, other_lag) in enumerate(local):
-            here, there = (_RANK[name], lag), (_RANK[other], other_lag)
+            here, there = (
+                (_VARIABLE_ORDER[name], lag),
+                (_VARIABLE_ORDER[other], other_lag),
+            )
             if here > there:
                 continue
             block = shift(gram[..., parts[i], parts[j]], lag)
@@ -178,7 +184,7 @@ def _add_products(sums, local, has_common, columns, weight, factor):
 
 
 def _products(a: Float[Array, "*b r p"], b: Float[Array, "*b r q"]) -> Array:
-    """Of all columns of one with those of the other; few rows fused."""
+    """Returns `a^T b`; a sum of fused outer products where there are few rows."""
     if a.shape[-2] > 3:
         return jnp.einsum("...ra,...rb->...ab", a, b)
     term = lambda r: a[..., r, :, None] * b[..., r, None, :]
@@ -186,12 +192,12 @@ def _products(a: Float[Array, "*b r p"], b: Float[Array, "*b r q"]) -> Array:
 
 
 def shift_back(x: Float[Array, "h t *b"], lag: int) -> Float[Array, "h t *b"]:
-    """What frame k - lag holds, at frame k; the first repeats."""
+    """Returns the value of frame k - lag at frame k; the first repeats."""
     return x[:, jnp.maximum(jnp.arange(x.shape[1]) - lag, 0)]
 
 
 def _move(frame, name, step, turn):
-    """First order in the step, which is all that a derivative at 0 sees."""
+    """Moves a variable to first order, which suffices for derivatives at 0."""
     if name == "pose":
         step = jnp.einsum("jab,jb->ja", turn, step.reshape(23, 3))
         return dataclasses.replace(frame, person_pose=frame.pose + step)
@@ -201,7 +207,7 @@ def _move(frame, name, step, turn):
 
 
 def _nudge(pose, step):
-    """`retract_pose` to first order."""
+    """Applies `retract_pose` to first order."""
     rotation = pose[:3, :3]
     rotation = rotation + jnp.cross(rotation, jnp.broadcast_to(step[:3], (3, 3)))
     top = jnp.concatenate([rotation, (pose[:3, 3] + step[3:])[:, None]], axis=1)
@@ -216,7 +222,7 @@ def _move_shared(shared, name, step):
 
 
 def _free_of(problem, name, lag):
-    """Mask of a variable `lag` frames back; people share the cameras'."""
+    """Returns the mask of a variable `lag` frames back; people share the cameras'."""
     if name == "camera":
         free = problem.free.cameras[None]
     elif name == "root":

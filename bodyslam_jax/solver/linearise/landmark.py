@@ -1,9 +1,8 @@
 """The blocks of landmarks: dense tables of frames by landmarks of a group.
 
 All buckets are linearised at once, as pieces of one chunk's frames by `g` landmarks.
-What observations say is worked out in the camera frame (`linearise/projection.py`).
-Cameras take the sum over their landmarks, which is then turned to the axes of their
-steps.
+Derivatives are taken in the camera frame (`linearise/projection.py`). Camera blocks are
+sums over landmarks, rotated to the axes of the cameras' steps afterwards.
 """
 
 import equinox as eqx
@@ -25,7 +24,7 @@ from bodyslam_jax.solver.linearise.projection import (
 
 
 def gather(problem: Problem) -> Observations | None:
-    """Measurements of landmarks in the order of the tables; `None` without any."""
+    """Returns the observations of landmarks in the order of the tables, if any."""
     buckets = problem.layout.buckets
     factor = next((f for f in problem.factors if isinstance(f, Reprojection)), None)
     if factor is None or not buckets:
@@ -50,7 +49,7 @@ def _cut(table: Int[Array, "n f g"]) -> Int[Array, "u b g"]:
 
 
 def frames_of(first_chunk: Int[Array, " n"], width: int) -> Int[Array, "n f"]:
-    """Frames that each group spans, as their chunks stand."""
+    """Returns the frames that each group spans, as their chunks stand."""
     within = jnp.arange(width * CHUNK, dtype=first_chunk.dtype)
     return first_chunk[:, None] * CHUNK + within
 
@@ -62,7 +61,8 @@ def linearise_landmarks(
     state: State,
     sums: Sums,
 ) -> tuple[LandmarkBlocks, ...]:
-    """Tables of all buckets; what cameras and intrinsics gather goes to `sums`."""
+    """Returns the tables of all buckets, and adds blocks of cameras and intrinsics to
+    `sums`."""
     sizes = sums.sizes
     dtype = sizes.dtype
     if seen is None:
@@ -119,18 +119,18 @@ def linearise_landmarks(
 def _add_cameras(
     problem: Problem, seen: Observations, state: State, pixels: Pixels, sums: Sums
 ) -> None:
-    """Adds what all landmarks of a frame say of its camera."""
+    """Adds blocks and gradients of cameras, summed over each frame's landmarks."""
     sizes, point = sums.sizes, pixels.point
     chunk = jnp.arange(sizes.chunks, dtype=seen.chunk.dtype)[:, None]
     belongs = chunk == seen.chunk
-    # As a product: a scatter would take its pieces one by one.
+    # A matrix product: a scatter would add its pieces one by one.
     of_frames = lambda x: (belongs.astype(x.dtype) @ x.reshape(len(x), -1)).reshape(
         -1, *x.shape[2:]
     )
     total = lambda columns: jnp.stack(
         [jnp.stack([jnp.sum(x, axis=-1) for x in column], -1) for column in columns], -1
     )
-    # By the turn and by the place in the camera's axes: dp_C = [p]x ω - C^T dr'
+    # By rotation and by translation in the camera's axes: dp_C = [p]x ω - C^T dr'
     half = [cross(x, point) for x in pixels.square]
     rows = transposed(half)
     both = symmetric(lambda i, j: cross(rows[i], point)[j])
@@ -159,7 +159,7 @@ def add_prior(
     state: State,
     tables: tuple[LandmarkBlocks, ...],
 ) -> tuple[LandmarkBlocks, ...]:
-    """The tables with what is known of their landmarks besides."""
+    """Returns the tables with the blocks of a prior on landmarks added."""
     free = problem.free.landmarks
     error = prior.residual(state)
     weight = prior.loss.weight(jnp.sum(error**2, axis=-1))[:, None]

@@ -1,8 +1,8 @@
-"""The blocks of a prior that marginalisation left: dense, over the first chunks.
+"""The blocks of a marginal prior: one dense matrix over the first chunks.
 
-All that it couples is in the reduced system of chunks (`reduced_system.py`): the last
-postures and roots of the first chunk, cameras, globals. So it stays one matrix until
-that system is put together; globals go to theirs at once.
+All variables that it couples are in the reduced system of chunks (`reduced_system.py`):
+the last postures and roots of the first chunk, cameras, globals. So it stays one matrix
+until that system is assembled; only blocks of globals are added at once.
 """
 
 import dataclasses
@@ -22,7 +22,8 @@ from bodyslam_jax.solver.posture import from_turns, to_coordinates
 def linearise_marginal_prior(
     problem: Problem, prior: MarginalPrior, state: State, sums: Sums
 ) -> PriorBlocks:
-    """Its dense matrix; gradients and globals go to `sums`."""
+    """Returns the dense `J^T J` of a prior, and adds gradients
+    and globals to `sums`."""
     sizes = sums.sizes
     first = prior.first_frames(state)
     zero = first.zero_step()
@@ -65,8 +66,9 @@ def linearise_marginal_prior(
 def _jacobian(
     prior: MarginalPrior, first: State, there: Float[Array, " n"], index: "Indices"
 ) -> Float[Array, "n n"]:
-    """Of the residual, by the prior's coordinates at a state; `there` is `x ⊖ x̂`."""
-    # Cameras move together; what else turns does so by itself.
+    """Returns the derivative of the residual by the prior's coordinates at a state,
+    where `there` is `x ⊖ x̂`."""
+    # The alignment couples all cameras; rotations of people are independent.
     nobody = {"roots": first.roots[:0], "poses": first.poses[:0]}
     nobody |= {"shapes": first.shapes[:0]}
     estimate = dataclasses.replace(prior.estimate, **nobody)
@@ -89,7 +91,7 @@ def _jacobian(
 def diagonal_of_prior(
     prior: PriorBlocks, sizes: Sizes, frames: int
 ) -> tuple[Array, Array, Array]:
-    """The diagonal by cameras, roots and (coupled) postures, of all frames."""
+    """Returns the diagonals of cameras, roots and (coupled) postures, of all frames."""
     h, t, r = sizes.people, frames, 6 * prior.reach
     diagonal = jnp.diagonal(prior.matrix)
     head = h * prior.person
@@ -107,7 +109,7 @@ def diagonal_of_prior(
 
 @dataclasses.dataclass(frozen=True)
 class Indices:
-    """Where the solver's variables stand in a prior's coordinates."""
+    """Indices of the solver's variables among a prior's coordinates."""
 
     roots: Int[np.ndarray, "h r"]
     postures: Int[np.ndarray, "h 69"]
@@ -120,7 +122,8 @@ class Indices:
 
 
 def indices(prior: MarginalPrior, sizes: Sizes) -> Indices:
-    """Groups that are held have no place in the solver's globals, and people none."""
+    """Returns the indices of a prior; globals that are held, and people who are, have
+    none."""
     first = prior.estimate
     h, i, g = sizes.people, len(first.intrinsics), len(first.globals)
     start = np.cumsum([0, 1, i, g, 10 * h, 6 * prior.frames, 6 * prior.reach * h])
@@ -140,6 +143,6 @@ def indices(prior: MarginalPrior, sizes: Sizes) -> Indices:
 
 
 def _step_of(prior: MarginalPrior, zero, vector):
-    """The step of the first frames with these `coordinates`, 0 elsewhere."""
+    """Returns the step of the first frames with these `coordinates`, 0 elsewhere."""
     take = jax.linear_transpose(lambda s: coordinates(s, prior.reach), zero)
     return take(vector)[0]

@@ -1,12 +1,12 @@
-"""What observations of landmarks say of their points, in the camera frame.
+"""Residuals and derivatives of landmark observations, in the camera frame.
 
 With `P` a weighted pixel's derivative by the point in the camera frame, every block of
 an observation follows from `P^T P`, since
 
     dp_C/dl = C^T,  dp_C/dr' = -C^T,  dp_C/dω = [p_C]x  for C Exp(ω).
 
-Vectors here are lists of three arrays `u b g`, and a 3 x 3 the list of its columns:
-parts of one stacked array would be copied before they are used.
+Vectors here are lists of three arrays `u b g`, and a 3 x 3 matrix is the list of its
+columns: parts of one stacked array would be copied before they are used.
 """
 
 import functools
@@ -26,8 +26,8 @@ Square = list[Vector]
 
 
 class Pixels(NamedTuple):
-    """Sums over the two coordinates of each observation, in the state's precision but
-    for `square` and `by_intrinsics`, which have that of blocks."""
+    """Sums over the two coordinates of each observation. All are in the state's
+    precision except `square` and `by_intrinsics`, which have that of blocks."""
 
     C: Square
     """`C_WC`; arrays `u b 1`."""
@@ -40,7 +40,7 @@ class Pixels(NamedTuple):
     by_intrinsics: list[Vector]
     """`P^T Q` by columns, with Q the pixel's derivative by intrinsics."""
     intrinsics: Float[Array, "i i"]
-    """`Q^T Q`, of all observations."""
+    """`Q^T Q`, summed over all observations."""
     intrinsics_slope: Float[Array, " i"]
     cost: Float[Array, ""]
 
@@ -52,7 +52,8 @@ def see(
     state: State,
     sizes: Sizes,
 ) -> Pixels:
-    """All observations at a state, weighted; derivatives by held intrinsics are 0."""
+    """Evaluates all observations at a state, weighted; derivatives by held intrinsics
+    are 0."""
     camera = state.cameras.reshape(-1, CHUNK, 4, 4)[seen.chunk][..., :3, :, None]
     C, centre = camera[:, :, :, :3], camera[:, :, :, 3]
     point = jnp.moveaxis(state.landmarks[seen.landmark], 2, 1)[:, None]
@@ -100,7 +101,7 @@ def dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """`a x b`, in the precision of `a`."""
+    """Returns `a x b`, in the precision of `a`."""
     b = [x.astype(a[0].dtype) for x in b]
     ahead, behind = (1, 2, 0), (2, 0, 1)
     return [a[i] * b[j] - a[j] * b[i] for i, j in zip(ahead, behind, strict=True)]
@@ -115,6 +116,6 @@ def transposed(columns: Square) -> Square:
 
 
 def symmetric(entry: Callable[[int, int], Array]) -> Square:
-    """A symmetric 3 x 3, each entry worked out once."""
+    """Returns a symmetric 3 x 3 matrix, with each entry computed once."""
     known = {(i, j): entry(i, j) for i in range(3) for j in range(i, 3)}
     return [[known[min(i, j), max(i, j)] for i in range(3)] for j in range(3)]
