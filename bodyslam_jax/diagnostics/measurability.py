@@ -12,7 +12,7 @@ from bodyslam_jax.body.skeleton import PELVIS
 from bodyslam_jax.diagnostics.measured import Measured, pixels_per_metre
 from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.people.costs import KEYPOINT_SIGMA
-from bodyslam_jax.people.keypoint_errors import CORRELATION_TIME, DETECTOR_FLOOR
+from bodyslam_jax.people.keypoint_errors import CORRELATION_TIME, MIN_DETECTOR_SIGMA_PX
 from bodyslam_jax.types import JointEstimate, Keypoints, Result, Sequence
 
 _HORIZONTAL_AXES = [0, 2]
@@ -91,7 +91,7 @@ def speed_noise(
     if not enough.any():
         return np.inf
     pixels = pixels_per_metre(joint, person)[stretch][enough]
-    sigma = np.hypot(KEYPOINT_SIGMA * pixels[:, None], DETECTOR_FLOOR)
+    sigma = np.hypot(KEYPOINT_SIGMA * pixels[:, None], MIN_DETECTOR_SIGMA_PX)
     weight = np.where(here[enough], sigma**-2, 0.0)
     uv = sequence.keypoints.uv[person, stretch][enough]
     centre = (weight[..., None] * uv).sum(1) / weight.sum(1)[:, None]

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from bodyslam_jax import people
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import BODY25
-from bodyslam_jax.people.keypoint_errors import DETECTOR_FLOOR
+from bodyslam_jax.people.keypoint_errors import MIN_DETECTOR_SIGMA_PX
 from bodyslam_jax.types import JointEstimate, Sequence
 
 _SIDES = ("left", "right")
@@ -115,7 +115,7 @@ def joint_sigma(
             image, the detector's error in pixels dominates.
     """
     small = np.hypot(
-        1.0, DETECTOR_FLOOR / (_KEYPOINT_ERROR_M * np.maximum(pixels, 1e-3))
+        1.0, MIN_DETECTOR_SIGMA_PX / (_KEYPOINT_ERROR_M * np.maximum(pixels, 1e-3))
     )
     sigma = np.where(given, _TRUNK_SIGMA_WITH_BODY_M, _TRUNK_SIGMA_M * small)[
         :, None

@@ -1,4 +1,4 @@
-"""People: bodies from keypoints or from a regressor, made ready for the graph."""
+"""Estimates people's bodies in the camera frame, from keypoints or from a regressor."""
 
 from bodyslam_jax.people.bodies import estimate_bodies as estimate_bodies
 from bodyslam_jax.people.bodies import nobody as nobody

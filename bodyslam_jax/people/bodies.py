@@ -1,4 +1,4 @@
-"""Bodies in the camera frame, from a regressor's bodies or from keypoints."""
+"""Estimates bodies in the camera frame, from a regressor's bodies or from keypoints."""
 
 import dataclasses
 
@@ -16,8 +16,8 @@ from bodyslam_jax.types import Bodies, Sequence
 def estimate_bodies(
     sequence: Sequence, body: BodyModel, settings: PeopleFit = PeopleFit()
 ) -> Bodies:
-    """A regressor's bodies, cleaned; bodies fitted to keypoints for people without any;
-    no bodies if there are neither."""
+    """Returns a regressor's bodies, cleaned, and bodies fitted to keypoints for people
+    without any; no bodies if there are neither."""
     camera, fps, keypoints = sequence.intrinsics, sequence.fps, sequence.keypoints
     if sequence.bodies is None:
         if keypoints is None:
@@ -39,7 +39,8 @@ def estimate_bodies(
 
 
 def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
-    """The sequence with these people only, in this order; all of them for `()`.
+    """Returns the sequence with these people only, in this order; with all of them for
+    `()`.
 
     **Raises:** `InputError` if the sequence lacks one of them.
     """
@@ -84,7 +85,8 @@ def select_people(sequence: Sequence, people: tuple[int, ...]) -> Sequence:
 
 
 def without_bodies(sequence: Sequence) -> Bool[np.ndarray, " h"]:
-    """People without regressed bodies, whose bodies are fitted to keypoints."""
+    """Returns the people without regressed bodies, whose bodies are fitted to
+    keypoints."""
     if sequence.bodies is not None:
         return np.logical_not(sequence.bodies.present.any(axis=1))
     count = 0 if sequence.keypoints is None else len(sequence.keypoints.uv)
@@ -92,7 +94,8 @@ def without_bodies(sequence: Sequence) -> Bool[np.ndarray, " h"]:
 
 
 def nobody(num_frames: int) -> Bodies:
-    """Bodies (0 people) of a video without people, or whose people are left out."""
+    """Returns bodies (0 people) of a video without people, or whose people are
+    ignored."""
     t = num_frames
     return Bodies(
         np.zeros((0, t), bool),

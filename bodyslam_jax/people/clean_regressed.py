@@ -1,6 +1,6 @@
-"""Cleaning of regressed bodies for initialisation.
+"""Cleans regressed bodies for initialisation.
 
-Regressors process single images: depth jitters by centimetres a frame, front and back
+Regressors process single images: depth jitters by centimetres per frame, front and back
 are confused in some frames, frames are missing, β varies. Postures are not smoothed:
 that would shorten the steps of a walk, from which the scale is estimated.
 """
@@ -19,7 +19,7 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.geometry.lengths import padded_length
-from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
+from bodyslam_jax.people.costs import MIN_DEPTH_M, robust
 from bodyslam_jax.people.hypotheses import find_turned
 from bodyslam_jax.people.keypoint_errors import (
     ROBUST_SCALE,
@@ -28,8 +28,8 @@ from bodyslam_jax.people.keypoint_errors import (
     pixels_per_metre,
 )
 from bodyslam_jax.people.person_state import (
-    DEPTH_JITTER,
-    POSITION_JITTER,
+    DEPTH_JITTER_M,
+    POSITION_JITTER_M,
     PersonState,
     bodies_from_roots,
     roots_from_bodies,
@@ -42,32 +42,32 @@ from bodyslam_jax.people.skeleton import (
 )
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
-_DEPTH_ERROR = 0.05
-"""Standard deviation of a regressor's depth, as a share of it."""
+_RELATIVE_DEPTH_SIGMA = 0.05
+"""Relative standard deviation of a regressor's depth."""
 _HALF_TURN = np.diag([-1.0, 1.0, -1.0])
-"""About H's y axis."""
+"""Rotation by π about H's y axis."""
 _PLACING_STEPS = 10
 _REGRESSOR_SHAPE_GAIN = 1.2
-"""Regressed shapes are shrunk to the mean, by a factor of 0.5 to 0.8 with an error of
-0.3; this gain is about the best linear estimate."""
+"""Regressed shapes are shrunk towards the mean, by a factor of 0.5 to 0.8 with an error
+of 0.3; this gain is about the best linear estimate."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BodyNoise:
     """Standard deviation of the white part of a regressor's errors, per person.
 
-    From second differences, which include true acceleration: upper bounds. The larger,
-    slowly varying part of the errors is not included.
+    It is estimated from second differences, which include true acceleration, and hence
+    an upper bound. The larger, slowly varying part of the errors is not included.
     """
 
     orientation: Float[np.ndarray, " h"]
-    """rad, per axis."""
+    """Standard deviation of the orientation, rad per axis."""
     posture: Float[np.ndarray, " h"]
-    """rad, per axis, all joints."""
+    """Standard deviation of joint angles, rad per axis, over all joints."""
     depth: Float[np.ndarray, " h"]
-    """m"""
+    """Standard deviation of the depth, m."""
     shape: Float[np.ndarray, "h 10"]
-    """Spread of β over the frames."""
+    """Standard deviation of β over the frames."""
 
 
 def prepare_bodies(
@@ -78,8 +78,8 @@ def prepare_bodies(
     fps: float,
     settings: PeopleFit = PeopleFit(),
 ) -> Bodies:
-    """One shape per person, front-back confusions and short gaps corrected, smooth
-    depth.
+    """Returns bodies with one shape per person, corrected front-back confusions, filled
+    short gaps, and smooth depth.
 
     The pelvis is fitted to the keypoints, if any, with the posture held fixed and the
     regressor's depth as a measurement. Person h of `bodies` is person h of `keypoints`.
@@ -95,7 +95,7 @@ def prepare_bodies(
     )
     for h in range(len(roots.present)):
         T_CH = prepared.T_CH[h]
-        valid = roots.present[h] & (T_CH[:, 2, 3] > DEPTH_FLOOR)
+        valid = roots.present[h] & (T_CH[:, 2, 3] > MIN_DEPTH_M)
         prepared.present[h] = valid
         where = np.flatnonzero(valid)
         if not len(where):
@@ -149,7 +149,7 @@ def body_noise(bodies: Bodies) -> BodyNoise:
 
 
 def _spread(values: np.ndarray) -> float:
-    """Standard deviation about zero, from the median: outliers do not count."""
+    """Returns the standard deviation about zero, robustly from the median."""
     return 1.4826 * float(np.median(np.abs(values)))
 
 
@@ -163,12 +163,13 @@ def _place_person(
     sigma: np.ndarray,
     fps: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Orientation and pelvis in C of the frames `where`, flips and jitter taken out."""
+    """Returns orientation and pelvis position in C for the frames `where`, with
+    front-back flips and jitter removed."""
     dtype = skeleton.offset.dtype
     T_CH = roots.T_CH[person, where]
     both = np.stack([T_CH[:, :3, :3], T_CH[:, :3, :3] @ _HALF_TURN], axis=1)
     angles = roots.body_pose[person, where, :21].reshape(-1, 63)
-    depth_sigma = _DEPTH_ERROR * T_CH[:, 2, 3]
+    depth_sigma = _RELATIVE_DEPTH_SIGMA * T_CH[:, 2, 3]
     rows = (both, angles, T_CH[:, :3, 3], uv, sigma, depth_sigma)
     length = padded_length(len(where)) - len(where)
     padded = [
@@ -198,7 +199,8 @@ def _place_bodies(
     sigma: Float[Array, "t 25"],
     depth_sigma: Float[Array, " t"],
 ) -> tuple[Float[Array, "t 2 3"], Float[Array, "t 2 25 2"], Float[Array, "t 2 24 3"]]:
-    """Pelvis of each frame for either orientation, by robust Gauss--Newton.
+    """Estimates the pelvis of each frame for both orientations, by robust
+    Gauss--Newton.
 
     **Returns:** positions in C, keypoints of the body there, px, and joints about the
     pelvis in C.
@@ -206,7 +208,7 @@ def _place_bodies(
 
     def one(R, points, start, uv, sigma, depth_sigma):
         rotated = points @ R.T
-        # Without keypoints nothing but the regressor's own place is known.
+        # Without keypoints only the regressor's own position is known.
         across = jnp.where(jnp.any(sigma < jnp.inf), 3.0, 0.01).astype(start.dtype)
         prior_sigma = jnp.stack([across, across, depth_sigma])
 
@@ -222,7 +224,7 @@ def _place_bodies(
             hessian = jnp.einsum("kci,kcj->ij", weighted, jac) + jnp.diag(prior)
             gradient = jnp.einsum("kci,kc->i", weighted, r) + prior * (p - start)
             moved = p - jnp.linalg.solve(hessian, gradient)
-            return moved.at[2].max(DEPTH_FLOOR)
+            return moved.at[2].max(MIN_DEPTH_M)
 
         p = jax.lax.fori_loop(0, _PLACING_STEPS, step, start)
         return p, project(intrinsics, rotated + p)
@@ -240,13 +242,14 @@ def _smooth(
     where: np.ndarray,
     fps: float,
 ) -> Float[np.ndarray, "m 3"]:
-    """Direction and depth as robustly smoothed curves, at the frames `where`."""
+    """Returns the positions with direction and depth robustly smoothed, at the frames
+    `where`."""
     depth = position[:, 2]
     mean_depth = float(np.median(depth))
     slow = (30 / fps) ** 1.5
-    across = POSITION_JITTER * slow / mean_depth
+    across = POSITION_JITTER_M * slow / mean_depth
     coordinates = np.column_stack([position[:, :2] / depth[:, None], depth])
-    jitter = (across, across, DEPTH_JITTER * slow)
+    jitter = (across, across, DEPTH_JITTER_M * slow)
     x, y, z = (
         _smooth_curve(values, where, sigma)
         for values, sigma in zip(coordinates.T, jitter)
@@ -257,7 +260,8 @@ def _smooth(
 def _smooth_curve(
     values: Float[np.ndarray, " m"], where: np.ndarray, jitter: float
 ) -> Float[np.ndarray, " m"]:
-    """Whittaker's smoother with Student weights: second differences of σ `jitter`.
+    """Applies Whittaker's smoother with Student weights: second differences have the
+    standard deviation `jitter`.
 
     The measurement noise is estimated from the values' second differences; its variance
     is multiplied by 10 for errors that are correlated over about ten frames.

@@ -1,10 +1,10 @@
 """Cost of one posed body against the keypoints of one frame, and its linearisation.
 
-The unknowns of a frame are a small rotation δ (left, in C) of the root orientation,
-the pelvis position p_C and the latent posture z: `6 + k` numbers, then the 10 of shape
-β that all frames share. Robust cost: Geman and McClure, `ρ(s) = s / (1 + s / c²)` of
-the squared whitened distance s, as in SMPLify (Bogo et al., 2016), which
-has it in pixels.
+The unknowns of a frame are a small rotation δ (left, in C) of the root orientation, the
+pelvis position p_C and the latent posture z: `6 + k` numbers, followed by the 10 of
+shape β that all frames share. The robust cost is that of Geman and McClure,
+`ρ(s) = s / (1 + s / c²)` of the squared whitened distance s, as in SMPLify (Bogo et
+al., 2016), which measures it in pixels.
 """
 
 import equinox as eqx
@@ -30,24 +30,24 @@ KEYPOINT_SIGMA = np.array(
 adult, twice that at hips and neck, which every detector puts elsewhere (OpenPose
 outside and below SMPL's, MediaPipe inside); heads differ by more than annotators."""
 
-DEPTH_FLOOR = 0.3
-"""m: nobody is fitted closer to the camera."""
+MIN_DEPTH_M = 0.3
+"""Least distance from the camera at which a person is fitted."""
 
 
 class Fit(eqx.Module):
-    """One body in one frame (or, with a leading axis, in each of many)."""
+    """Pose of one body in one frame (or, with a leading axis, in each of many)."""
 
     orientation: Float[Array, "*b 3 3"]
     """R_CH."""
     position: Float[Array, "*b 3"]
-    """Pelvis joint in C, m."""
+    """Position of the pelvis joint in C, m."""
     latent: Float[Array, "*b k"]
     """Posture, in standard deviations of the prior's components."""
 
     def moved(self, step: Float[Array, "*b n"]) -> "Fit":
         turn = so3.exp(step[..., :3])
         position = self.position + step[..., 3:6]
-        depth = jnp.maximum(position[..., 2:], DEPTH_FLOOR)
+        depth = jnp.maximum(position[..., 2:], MIN_DEPTH_M)
         return Fit(
             turn @ self.orientation,
             jnp.concatenate([position[..., :2], depth], -1),
@@ -56,18 +56,19 @@ class Fit(eqx.Module):
 
 
 class Lifted(eqx.Module):
-    """Posture predicted from the keypoints around a frame (`lift`)."""
+    """Posture predicted from the keypoints around a frame (`lift`), with its
+    uncertainty."""
 
     orientation: Float[Array, "*b 3 3"]
     """R_CH."""
     latent: Float[Array, "*b k"]
     latent_sigma: Float[Array, "*b k"]
-    """Standard deviation of each component, in the prior's."""
+    """Standard deviation of each component, in units of the prior's."""
     turn_sigma: Float[Array, "*b"]
-    """Of the orientation, rad per axis."""
+    """Standard deviation of the orientation, rad per axis."""
 
     def widened(self, factor: Float[Array, "*b"]) -> "Lifted":
-        """With standard deviations multiplied by `factor`."""
+        """Returns the posture with its standard deviations multiplied by `factor`."""
         return Lifted(
             self.orientation,
             self.latent,
@@ -83,13 +84,14 @@ class Scene(eqx.Module):
     prior: PosturePrior
     intrinsics: Float[Array, " i"]
     robust_scale: Float[Array, ""]
-    """c, in standard deviations."""
+    """Scale c of the robust loss on keypoints, in standard deviations."""
     limit_sigma: Float[Array, ""]
-    """How softly the angles' limits are held, rad."""
+    """Standard deviation of the soft limits of joint angles, rad."""
     upright_weight: Float[Array, ""]
-    """1/σ² of the body axis' lean out of the image plane (sine)."""
+    """Weight 1/σ² of the body axis' lean out of the image plane (sine)."""
     lift_scale: Float[Array, ""]
-    """c of a guessed posture, in standard deviations of one component."""
+    """Scale c of the robust loss on the lifted posture, in standard deviations of one
+    component."""
 
 
 class Normal(eqx.Module):
@@ -97,7 +99,7 @@ class Normal(eqx.Module):
 
     hessian: Float[Array, "*b n n"]
     cross: Float[Array, "*b n s"]
-    """Between the frame's unknowns and the shape."""
+    """Block between the frame's unknowns and the shape."""
     shape_hessian: Float[Array, "*b s s"]
     gradient: Float[Array, "*b n"]
     shape_gradient: Float[Array, "*b s"]
@@ -112,8 +114,12 @@ def cost(
     sigma: Float[Array, " 25"],
     lifted: Lifted,
 ) -> Float[Array, ""]:
-    """Robust keypoints, soft limits, upright prior and guess of one frame; not the
-    posture's own prior, which is temporal in a chain and static in a single frame."""
+    """Returns the cost of one frame: robust keypoints, soft joint limits, upright prior
+    and lifted posture.
+
+    The prior on posture is excluded: it is temporal in a chain and static in a single
+    frame.
+    """
     angles = scene.prior.angles(fit.latent)
     _, local = place_points(scene.skeleton, angles, shape)
     p_C = local @ fit.orientation.T + fit.position
@@ -136,7 +142,7 @@ def linearise(
     sigma: Float[Array, " 25"],
     lifted: Lifted,
 ) -> Normal:
-    """The same as `cost`, with its derivatives."""
+    """Returns `cost` with its first and (Gauss--Newton) second derivatives."""
     size = 6 + fit.latent.shape[-1]
     angles = scene.prior.angles(fit.latent)
     points = pose_points(scene.skeleton, angles, shape)
@@ -147,7 +153,7 @@ def linearise(
     residual = (project(scene.intrinsics, p_C) - uv) / sigma[:, None]
     value, weight = robust(jnp.sum(residual**2, -1), scene.robust_scale)
 
-    # Pixels by: a turn (δ x p moves p), a shift, the posture, the shape.
+    # Derivatives of pixels by rotation (δ x p moves p), translation, posture, shape.
     eye = jnp.eye(3, dtype=p_C.dtype)
     turned = jnp.swapaxes(jnp.cross(eye[None], rotated[:, None]), -1, -2)
     view_H = view @ fit.orientation
@@ -193,7 +199,8 @@ def linearise(
 def robust(
     squared: Float[Array, "*b"], scale: Float[Array, ""]
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
-    """Geman and McClure's ρ of squared whitened distances, and its derivative."""
+    """Returns Geman and McClure's ρ of squared whitened distances, and its
+    derivative."""
     ratio = 1 + squared / scale**2
     return squared / ratio, 1 / ratio**2
 
@@ -205,17 +212,17 @@ def _lift_scale(scene: Scene, lifted: Lifted) -> Float[Array, ""]:
 def _unlike(
     orientation: Float[Array, "3 3"], latent: Float[Array, " k"], lifted: Lifted
 ) -> Float[Array, " d"]:
-    """How far a body is from the one guessed, in standard deviations; 0 where these are
-    infinite."""
+    """Returns the difference of a body from the lifted one, in standard deviations; 0
+    where these are infinite."""
     turn = so3.log(orientation @ lifted.orientation.T) / lifted.turn_sigma
     return jnp.concatenate([turn, (latent - lifted.latent) / lifted.latent_sigma])
 
 
 def _unlike_by_own(lifted: Lifted) -> Float[Array, "d n"]:
-    """Its derivatives by the frame's unknowns.
+    """Returns the derivatives of `_unlike` with respect to the frame's unknowns.
 
-    That of a turn's logarithm by a further turn is taken for the identity: the exact
-    one leaves the logarithm as it is, so the gradient of its square is exact.
+    The derivative of a rotation's logarithm is approximated by the identity. The exact
+    one maps the logarithm to itself, so the gradient of its square is exact.
     """
     count = lifted.latent.shape[-1]
     by_turn = jnp.eye(3, dtype=lifted.latent.dtype) / lifted.turn_sigma

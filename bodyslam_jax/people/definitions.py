@@ -1,9 +1,9 @@
-"""Offsets between a detector's keypoints and the joints of the body model.
+"""Removes offsets between a detector's keypoints and the joints of the body model.
 
-Every detector has its own definition of hip or knee, the same in all frames of a
-person. What is common to all people is known (`body.keypoint_definitions`); the fit
+Every detector has its own definition of hip or knee, which is the same in all frames of
+a person. The part common to all people is known (`body.keypoint_definitions`); the fit
 estimates the rest with the shape (`skeleton`: fixed to bones). Both must be removed
-before keypoints are compared with the model's joints: a leg that seems 5 % too short
+before keypoints are compared with the model's joints: a leg that appears 5 % too short
 bends the knee by 36 degrees.
 """
 
@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.geometry.lengths import padded_length
-from bodyslam_jax.people.costs import DEPTH_FLOOR, robust
+from bodyslam_jax.people.costs import MIN_DEPTH_M, robust
 from bodyslam_jax.people.keypoint_errors import (
     CORRELATION_TIME,
     ROBUST_SCALE,
@@ -35,7 +35,7 @@ from bodyslam_jax.people.skeleton import (
 )
 from bodyslam_jax.types import Intrinsics, Keypoints
 
-_ROUNDS = 6
+_NUM_ROUNDS = 6
 
 
 def as_body_keypoints(
@@ -46,13 +46,14 @@ def as_body_keypoints(
     body: BodyModel,
     fps: float,
 ) -> Keypoints:
-    """Keypoints moved from where the detector puts them to the joints of the body.
+    """Returns the keypoints moved from the detector's definitions to the joints of the
+    body.
 
-    The bodies of the people `chosen` were fitted to these keypoints. What their offsets
-    differ by from the detector's definition is estimated by robust linear regression on
-    the reprojection residuals, with the priors of `skeleton`; frames within the
-    correlation time of the errors count once. Of other people only the definition is
-    removed. Frames without a body are unchanged.
+    The bodies of the people `chosen` were fitted to these keypoints. The deviation of
+    their offsets from the detector's definition is estimated by robust linear
+    regression on the reprojection residuals, with the priors of `skeleton`; frames
+    within the correlation time of the errors count once. For other people only the
+    definition is removed. Frames without a body are unchanged.
     """
     uv = keypoints.uv.copy()
     graphs = make_skeleton(body, 0.0)
@@ -65,7 +66,7 @@ def as_body_keypoints(
     for h in np.flatnonzero((chosen | defined) & roots.present.any(axis=1)):
         where = np.flatnonzero(roots.present[h])
         T_CH = roots.T_CH[h, where]
-        depth = np.maximum(T_CH[:, 2, 3], DEPTH_FLOOR)
+        depth = np.maximum(T_CH[:, 2, 3], MIN_DEPTH_M)
         sigma = keypoint_sigma(keypoints, intrinsics, int(h))[where]
         sigma = (
             in_pixels(sigma, focal / depth)
@@ -100,9 +101,9 @@ def _shift(
     shape: Float[Array, " s"],
     scale: Float[Array, ""],
 ) -> Float[Array, "t 25 2"]:
-    """How far the detector's definitions move each keypoint in the image, px: from
-    those of the skeleton `graphs` to those of `skeleton`, and on by what is estimated.
-    """
+    """Returns the displacement of each keypoint in the image, px, by the detector's
+    definitions: from those of the skeleton `graphs` to those of `skeleton`, plus the
+    estimated deviation."""
 
     def frame(R, p, angles):
         plain = place_points(graphs, angles, shape)[1] @ R.T + p
@@ -126,4 +127,4 @@ def _shift(
         return jnp.linalg.solve(hessian + jnp.eye(len(right)), right)
 
     start = jnp.zeros(jac.shape[-1], jac.dtype)
-    return defined + jac @ jax.lax.fori_loop(0, _ROUNDS, fit, start)
+    return defined + jac @ jax.lax.fori_loop(0, _NUM_ROUNDS, fit, start)

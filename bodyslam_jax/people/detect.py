@@ -1,11 +1,11 @@
-"""People and keypoints from images: YOLOX finds boxes, RTMPose points in each box.
+"""Detects people and keypoints: YOLOX finds boxes, RTMPose points in each box.
 
-An alternative to the networks that ship (`find`). The models are fetched once to the
-user's cache and checked against their SHA-256; both are Apache-2.0:
+It is an alternative to the networks of the package (`find`). The models are downloaded
+once to the user's cache and checked against their SHA-256; both are Apache-2.0:
 
 - YOLOX-S (Ge et al., 2021), Megvii's own export;
-- DWPose-L (Yang et al., 2023), an RTMPose with 133 keypoints, of which the body's and
-  the feet's are used.
+- DWPose-L (Yang et al., 2023), an RTMPose with 133 keypoints, of which those of body
+  and feet are used.
 
 Everything but the networks is plain NumPy. Images are BGR, as OpenCV reads them.
 """
@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """A network that can be fetched."""
+    """A network that can be downloaded."""
 
     name: str
     url: str
@@ -55,7 +55,7 @@ POSE = Model(
 )
 
 _MIN_SCORE = 0.5
-"""Smallest score of a box that counts as a person."""
+"""Score from which a box counts as a person."""
 _MAX_OVERLAP = 0.45
 """Intersection over union above which two boxes are one person's."""
 _MAX_PEOPLE = 8
@@ -76,13 +76,15 @@ def detect_people(
     offline: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> list[Float[np.ndarray, "p 25 3"]]:
-    """Keypoints (u, v in px, confidence) of the people in each image, in BODY_25 order.
+    """Returns the keypoints (u, v in px, confidence) of the people in each image, in
+    BODY_25 order.
 
     People are in no particular order and are not tracked; `io.keypoints.associate` does
     that. One image is in memory at a time.
 
     Args:
-        offline: never use the network; models must be in the cache, or one's own.
+        offline: does not use the internet; models must be in the cache, or the user's
+            own.
         progress: called with the number of images done.
 
     **Raises:** `InputError` if onnxruntime is not installed, or if a model is not
@@ -101,8 +103,8 @@ def detect_people(
 
 
 def model_path(own: str | None, model: Model, offline: bool) -> Path:
-    """The file of a model: `own`, the user's, or that in the cache, which is downloaded
-    if it is missing.
+    """Returns the file of a model: `own`, the user's, or that in the cache, which is
+    downloaded if it is missing.
 
     **Raises:** `InputError` with what to do if the file is not available.
     """
@@ -136,7 +138,7 @@ def model_path(own: str | None, model: Model, offline: bool) -> Path:
 def find_boxes(
     session: Any, image: UInt8[np.ndarray, "y x 3"]
 ) -> Float[np.ndarray, "p 4"]:
-    """Boxes `x0 y0 x1 y1` (px) of the largest people in an image."""
+    """Returns the boxes `x0 y0 x1 y1` (px) of the largest people in an image."""
     tensor = session.get_inputs()[0]
     height, width = (int(n) for n in tensor.shape[2:])
     scale = min(height / image.shape[0], width / image.shape[1])
@@ -155,7 +157,8 @@ def find_boxes(
 def decode_yolox(
     raw: Float[np.ndarray, "n c"], size: tuple[int, int], min_score: float
 ) -> tuple[Float[np.ndarray, "p 4"], Float[np.ndarray, " p"]]:
-    """Boxes of class 0, person, from YOLOX's raw output, in px of its canvas.
+    """Returns the boxes of class 0, person, from YOLOX's raw output, in px of its
+    canvas, and their scores.
 
     Rows are cells of grids of stride 8, 16, 32, row by row: offset of the centre from
     the cell and log of the size in strides, objectness, and a score for each class.
@@ -181,8 +184,8 @@ def decode_yolox(
 def suppress(
     boxes: Float[np.ndarray, "p 4"], score: Float[np.ndarray, " p"], max_overlap: float
 ) -> np.ndarray:
-    """Indices of boxes, best first, of which none overlaps a better one by more than
-    `max_overlap` (intersection over union)."""
+    """Returns the indices of boxes, best first, of which none overlaps a better one by
+    more than `max_overlap` (intersection over union)."""
     area = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
     left = np.argsort(-score, kind="stable")
     kept = []
@@ -199,11 +202,12 @@ def suppress(
 def find_keypoints(
     session: Any, image: UInt8[np.ndarray, "y x 3"], box: Float[np.ndarray, " 4"]
 ) -> Float[np.ndarray, "25 3"]:
-    """Keypoints (px, confidence) of the person in a box, in BODY_25 order."""
+    """Returns the keypoints (px, confidence) of the person in a box, in BODY_25
+    order."""
     tensor = session.get_inputs()[0]
     height, width = (int(n) for n in tensor.shape[2:])
     centre, extent = (box[:2] + box[2:]) / 2, _CROP_MARGIN * (box[2:] - box[:2])
-    # The crop has the network's aspect and holds the box: one scale for both axes.
+    # The crop has the network's aspect ratio and contains the box, at a single scale.
     step = max(extent[0] / width, extent[1] / height)
     corner = centre - step * np.array([width, height]) / 2
     x, y = corner[0] + step * np.arange(width), corner[1] + step * np.arange(height)
@@ -218,8 +222,8 @@ def find_keypoints(
 def decode_simcc(
     x: Float[np.ndarray, "k w"], y: Float[np.ndarray, "k h"]
 ) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
-    """Positions (px of the crop) and confidences of `k` keypoints from RTMPose's scores
-    of columns and rows (SimCC, two bins per pixel).
+    """Returns positions (px of the crop) and confidences of `k` keypoints from
+    RTMPose's scores of columns and rows (SimCC, two bins per pixel).
 
     The position is the bin with the highest score; the confidence is the lower of the
     two highest scores.
@@ -251,7 +255,8 @@ def sample(
     x: Float[np.ndarray, " w"],
     y: Float[np.ndarray, " h"],
 ) -> Float[np.ndarray, "h w 3"]:
-    """The image at a grid of columns x and rows y (px), bilinear; black outside."""
+    """Returns the image at a grid of columns x and rows y (px), bilinear; black
+    outside."""
     weights, indices, valid = [], [], []
     for where, size in ((y, image.shape[0]), (x, image.shape[1])):
         inside = (where > -1) & (where < size)

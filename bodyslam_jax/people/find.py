@@ -1,9 +1,9 @@
-"""Detection and tracking of people by the networks that ship.
+"""Detects and tracks people by the networks that ship with the package.
 
 MoveNet searches the whole image every third of a second, at a scale for people of at
 least a tenth of its longer side, and every second at one for smaller ones; in the
 frames in between it runs on a square around each predicted person. A person found in a
-search is also tracked backwards to the last one.
+search is also tracked backwards to the previous search.
 """
 
 import dataclasses
@@ -16,59 +16,60 @@ from jaxtyping import Bool, Float, UInt8
 from bodyslam_jax.config import Association, Detect
 from bodyslam_jax.io.keypoints.doubles import doubles, is_stray
 from bodyslam_jax.people import blazepose, movenet
-from bodyslam_jax.people.appearance import SIZE, describe
+from bodyslam_jax.people.appearance import DESCRIPTOR_SIZE, describe
 from bodyslam_jax.people.found import (
-    AGREES,
+    MAX_DISAGREEMENT,
     Found,
     as_body25,
     find_feet,
 )
 from bodyslam_jax.people.linking import link, remarks
-from bodyslam_jax.people.movenet import SURE, Region, sure_points
+from bodyslam_jax.people.movenet import MIN_SURE_SCORE, Region, sure_points
 from bodyslam_jax.people.networks import BLAZEPOSE, MOVENET, open_network
-from bodyslam_jax.people.phantoms import SMALLEST_CONFIRMED, is_phantom
+from bodyslam_jax.people.phantoms import MIN_CONFIRMED_HEIGHT_PX, is_phantom
 from bodyslam_jax.people.regions import behind, covered, regions, square_around
 from bodyslam_jax.people.tracking import Tracker, Tracklet, between, height
 from bodyslam_jax.sfm import SILHOUETTE_STEP
 
-_SEARCH_INTERVAL = 0.33
-"""Time between two searches of the whole image, s."""
-_MOST_PEOPLE = 8
-"""People that are followed, the largest ones first."""
-_COARSE, _SEARCH, _FINE = 320, 640, 1280
-"""Longer side of the image in MoveNet's input, px: for people who fill the image, for
-most, and for small ones."""
-_FINE_EVERY = 3
-"""Searches between two that look for small people, too."""
-_LARGEST = 250.0
-"""px of MoveNet's input: of larger people it makes several."""
-_SQUARE = 256
-_START, _CONTINUE, _SEEN = 0.22, 0.12, 0.1
+_SEARCH_INTERVAL_S = 0.33
+"""Time between two searches of the whole image."""
+_MAX_PEOPLE = 8
+"""Number of people that are followed, the largest ones first."""
+_COARSE_INPUT_PX, _SEARCH_INPUT_PX, _FINE_INPUT_PX = 320, 640, 1280
+"""Longer side of the image in MoveNet's input: for people who fill the image, for most,
+and for small ones."""
+_FINE_SEARCH_PERIOD = 3
+"""Every how many searches small people are searched for, too."""
+_MAX_PERSON_PX = 250.0
+"""Size in MoveNet's input above which it splits a person into several."""
+_SQUARE_INPUT_PX = 256
+_MIN_START_SCORE, _MIN_CONTINUE_SCORE, _MIN_MASK_SCORE = 0.22, 0.12, 0.1
 """Least score of MoveNet that begins a track, that continues one, and that masks the
-person in the images. Without people scores are 0.00 to 0.07."""
-_SOONER = 3
-"""Least frames between two searches after a track was lost."""
-_OVERLAP = 0.25
-"""Share of a person's box that others may cover while its colours are the person's."""
-_LITTLE = 0.03
+person in the images. Without people, scores are 0.00 to 0.07."""
+_MIN_SEARCH_GAP_FRAMES = 3
+"""Least number of frames between two searches after a track was lost."""
+_MAX_OVERLAP_SHARE = 0.25
+"""Share of a person's box covered by others up to which its colours are the
+person's."""
+_MIN_RELATIVE_VISIBILITY = 0.03
 """Least visibility (size times confidence, summed over time) of a person who is
 estimated, relative to that of the most visible person."""
-_BRIEF = 0.2
-"""s: shorter tracks are masked without a warning, as they may be false detections."""
-_PRESENCE = 0.5
+_MIN_REPORTED_TRACK_S = 0.2
+"""Shorter tracks are masked without a warning, as they may be false detections."""
+_MIN_PRESENCE = 0.5
 _Detections = tuple[Float[np.ndarray, "n 17 3"], Float[np.ndarray, " n"]]
 """COCO keypoints, and a score for each person."""
 
 
 @dataclasses.dataclass
 class _Frame:
-    """What was found in one image, and the image as long as it may be needed."""
+    """Detections in one image, and the image as long as it may be needed."""
 
     image: UInt8[np.ndarray, "y x 3"]
     mask: Bool[np.ndarray, "r c"]
-    """At every `SILHOUETTE_STEP`-th pixel, where people are."""
+    """Pixels that show people, at every `SILHOUETTE_STEP`-th pixel."""
     tracked: dict[int, np.ndarray]
-    """By number of the tracklet, COCO keypoints."""
+    """COCO keypoints by number of the tracklet."""
     others: list[np.ndarray]
 
 
@@ -79,7 +80,7 @@ def find_people_tracked(
     association: Association = Association(),
     progress: Callable[[int], None] | None = None,
 ) -> Found:
-    """People in the images of a video, and who is who.
+    """Detects and tracks the people in the images of a video.
 
     Args:
         images: BGR, in order; those since the last search are kept in memory.
@@ -87,7 +88,7 @@ def find_people_tracked(
             are recognised by clothes and size), and who is seen too briefly.
         progress: called with the number of images done.
 
-    **Raises:** `ValueError` if a network that ships is missing or damaged.
+    **Raises:** `ValueError` if a network of the package is missing or damaged.
     """
     finder = _Finder(fps, settings, association)
     for k, image in enumerate(images):
@@ -104,10 +105,14 @@ class _Finder:
         self.movenet = open_network(MOVENET)
         self.blazepose = open_network(BLAZEPOSE)
         self.fps, self.settings, self.association = fps, settings, association
-        self.whom = settings.min_height, _MOST_PEOPLE
+        self.whom = settings.min_height, _MAX_PEOPLE
         self.tracker = Tracker(fps, association.max_gap)
-        self.interval = max(1, round(_SEARCH_INTERVAL * fps))
-        self.next_search, self.last_search, self.searches = 0, -_SOONER, 0
+        self.interval = max(1, round(_SEARCH_INTERVAL_S * fps))
+        self.next_search, self.last_search, self.searches = (
+            0,
+            -_MIN_SEARCH_GAP_FRAMES,
+            0,
+        )
         self.recent: deque[tuple[int, _Frame]] = deque(maxlen=self.interval + 1)
         self.feet: dict[tuple[int, int], np.ndarray] = {}
         """By tracklet and frame: heel and big toe of both sides (4, 3)."""
@@ -118,7 +123,10 @@ class _Finder:
         size = tuple(-(-n // SILHOUETTE_STEP) for n in image.shape[:2])
         now = _Frame(image, np.zeros(size, bool), {}, [])
         expected = [t.expected(k, self.fps) for t in self.tracker.alive(k)]
-        found = [self._look(image, r, _SQUARE) for r in regions(expected, *self.whom)]
+        found = [
+            self._look(image, r, _SQUARE_INPUT_PX)
+            for r in regions(expected, *self.whom)
+        ]
         if k >= self.next_search:
             found += self._search(image)
             self.last_search, self.next_search = k, k + self.interval
@@ -126,7 +134,9 @@ class _Finder:
         looks = self._looks(image, points)
         first_new = len(self.tracker.tracklets)
         clear = ~behind(points, score)
-        who = self.tracker.update(k, points, looks, clear, clear & (score >= _START))
+        who = self.tracker.update(
+            k, points, looks, clear, clear & (score >= _MIN_START_SCORE)
+        )
         for row, number in zip(points, who.tolist(), strict=True):
             if number < 0:
                 now.others.append(row)
@@ -136,7 +146,7 @@ class _Finder:
         for number in range(first_new, len(self.tracker.tracklets)):
             self._look_back(k, number)
         if any(self._was_lost(t, k) for t in self.tracker.tracklets):
-            sooner = max(k + 1, self.last_search + _SOONER)
+            sooner = max(k + 1, self.last_search + _MIN_SEARCH_GAP_FRAMES)
             self.next_search = min(self.next_search, sooner)
         self.masks.append(np.packbits(now.mask, axis=1))
         self.recent.append((k, now))
@@ -146,7 +156,11 @@ class _Finder:
         phantoms = [p for p in everybody if self._is_phantom(p)]
         real = [p for p in everybody if not any(p is q for q in phantoms)]
         people = sorted(filter(self._is_estimated, real), key=_presence, reverse=True)
-        people = [p for p in people if _presence(p) > _LITTLE * _presence(people[0])]
+        people = [
+            p
+            for p in people
+            if _presence(p) > _MIN_RELATIVE_VISIBILITY * _presence(people[0])
+        ]
         people = _once(people)
         who = {
             (piece.number, frame): number
@@ -174,8 +188,8 @@ class _Finder:
             if any(pieces is p for p in people):
                 continue
             track = _track(pieces)
-            if len(track) >= _BRIEF * self.fps:
-                others += not is_stray(track, tracks, gap, SURE)
+            if len(track) >= _MIN_REPORTED_TRACK_S * self.fps:
+                others += not is_stray(track, tracks, gap, MIN_SURE_SCORE)
         if others > 0:
             warnings.append(
                 f"{others} more people, small or seen briefly, are kept out of the map "
@@ -190,12 +204,12 @@ class _Finder:
         )
 
     def _was_lost(self, tracklet: Tracklet, k: int) -> bool:
-        """Whether a track of sufficient size ended in the previous frame."""
+        """Returns whether a track of sufficient size ended in the previous frame."""
         large = height(tracklet.points[-1]) >= self.settings.min_height
         return large and tracklet.frames[-1] == k - 1
 
     def _is_estimated(self, pieces: list[Tracklet]) -> bool:
-        """Whether a person is large and visible long enough to be estimated."""
+        """Returns whether a person is large and visible long enough to be estimated."""
         heights = [height(p) for t in pieces for p in t.points]
         least = min(self.association.min_duration * self.fps, len(self.masks))
         return (
@@ -207,13 +221,16 @@ class _Finder:
         return is_phantom(pieces, set(self.feet), self.fps)
 
     def _search(self, image: np.ndarray) -> list[_Detections]:
-        """People anywhere in the image."""
+        """Returns the people anywhere in the image."""
         whole = (0, 0, image.shape[1], image.shape[0])
         longest = max(image.shape[:2])
-        found = [self._look(image, whole, _COARSE)]
-        found.append(self._look(image, whole, _SEARCH))
-        if longest > 1.3 * _SEARCH and self.searches % _FINE_EVERY == 0:
-            found.append(self._look(image, whole, min(longest, _FINE)))
+        found = [self._look(image, whole, _COARSE_INPUT_PX)]
+        found.append(self._look(image, whole, _SEARCH_INPUT_PX))
+        if (
+            longest > 1.3 * _SEARCH_INPUT_PX
+            and self.searches % _FINE_SEARCH_PERIOD == 0
+        ):
+            found.append(self._look(image, whole, min(longest, _FINE_INPUT_PX)))
         self.searches += 1
         return found
 
@@ -221,31 +238,32 @@ class _Finder:
         points, score = movenet.find_people(self.movenet, image, region, longer)
         scale = longer / max(region[2] - region[0], region[3] - region[1])
         sizes = np.array([movenet.box_size(p) for p in points])
-        kept = score >= _SEEN
-        if longer > _COARSE:
-            kept &= sizes * scale <= _LARGEST
+        kept = score >= _MIN_MASK_SCORE
+        if longer > _COARSE_INPUT_PX:
+            kept &= sizes * scale <= _MAX_PERSON_PX
         return points[kept], score[kept]
 
     def _looks(self, image: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Descriptors of clothes; NaN for people whom others overlap."""
+        """Returns descriptors of clothes; NaN for people whom others overlap."""
         boxes = [movenet.box(p) for p in points]
-        looks = np.full((len(points), SIZE), np.nan)
+        looks = np.full((len(points), DESCRIPTOR_SIZE), np.nan)
         for i, row in enumerate(points):
             others = [covered(boxes[i], b) for j, b in enumerate(boxes) if j != i]
-            if max(others, default=0.0) < _OVERLAP:
-                looks[i] = describe(image, row, movenet.SURE)
+            if max(others, default=0.0) < _MAX_OVERLAP_SHARE:
+                looks[i] = describe(image, row, movenet.MIN_SURE_SCORE)
         return looks
 
     def _note(self, k: int, frame: _Frame, number: int, points: np.ndarray) -> None:
-        """Somebody found in a frame: their feet and silhouette, too."""
+        """Records a person in a frame, with feet and silhouette if BlazePose confirms
+        the person."""
         frame.tracked[number] = points
-        square = blazepose.turned_square(points, movenet.SURE)
-        if square is None or height(points) < SMALLEST_CONFIRMED:
+        square = blazepose.turned_square(points, movenet.MIN_SURE_SCORE)
+        if square is None or height(points) < MIN_CONFIRMED_HEIGHT_PX:
             return
         pose = blazepose.read_pose(self.blazepose, frame.image, square)
         apart = blazepose.disagreement(pose, points)
         sure = sure_points(points)
-        if pose.presence < _PRESENCE or np.median(apart[sure]) > AGREES:
+        if pose.presence < _MIN_PRESENCE or np.median(apart[sure]) > MAX_DISAGREEMENT:
             return
         self.feet[number, k] = find_feet(pose, points, apart)
         size = frame.image.shape[0], frame.image.shape[1]
@@ -256,7 +274,7 @@ class _Finder:
         tracklet = self.tracker.tracklets[number]
         for index, frame in reversed(self.recent):
             first = tracklet.points[0]
-            near = self._look(frame.image, square_around(first), _SQUARE)
+            near = self._look(frame.image, square_around(first), _SQUARE_INPUT_PX)
             points, score = _merged([near])
             looks = self._looks(frame.image, points)
             cost = [
@@ -265,7 +283,7 @@ class _Finder:
             ]
             best = int(np.argmin(cost)) if cost else 0
             taken = frame.tracked.values()
-            if not cost or cost[best] >= 1 or score[best] < _CONTINUE:
+            if not cost or cost[best] >= 1 or score[best] < _MIN_CONTINUE_SCORE:
                 return
             if any(movenet.same_person(points[best], p) for p in taken):
                 return
@@ -275,7 +293,7 @@ class _Finder:
 
 
 def _merged(found: list[_Detections]) -> _Detections:
-    """Everybody once."""
+    """Returns the detections of several searches without duplicates."""
     if not found:
         return np.zeros((0, 17, 3)), np.zeros(0)
     points = np.concatenate([p for p, _ in found])
@@ -285,9 +303,9 @@ def _merged(found: list[_Detections]) -> _Detections:
 
 
 def _once(people: list[list[Tracklet]]) -> list[list[Tracklet]]:
-    """Everybody once: of two at one place at one time the more visible one, with the
-    pieces of the other from when that one is not seen."""
-    twice = doubles([_track(p) for p in people], SURE)
+    """Merges people who are at the same place at the same time: the more visible one is
+    kept, with the pieces of the other from frames in which the first is not seen."""
+    twice = doubles([_track(p) for p in people], MIN_SURE_SCORE)
     for i, j in twice.items():
         known = {frame for piece in people[j] for frame in piece.frames}
         more = [t for t in people[i] if known.isdisjoint(t.frames)]
@@ -296,7 +314,7 @@ def _once(people: list[list[Tracklet]]) -> list[list[Tracklet]]:
 
 
 def _track(pieces: list[Tracklet]) -> dict[int, np.ndarray]:
-    """A person's keypoints by frame."""
+    """Returns a person's keypoints by frame."""
     return {
         frame: points
         for t in pieces
@@ -305,7 +323,7 @@ def _track(pieces: list[Tracklet]) -> dict[int, np.ndarray]:
 
 
 def _of_phantom(pieces: list[Tracklet]) -> str:
-    """A line for what was taken for a person, and why it is none."""
+    """Returns a warning about a detection that is not a person."""
     first, last = pieces[0].frames[0], pieces[-1].frames[-1]
     u, v = np.median([p[:, :2] for t in pieces for p in t.points], axis=(0, 1))
     return (
@@ -317,5 +335,5 @@ def _of_phantom(pieces: list[Tracklet]) -> str:
 
 
 def _presence(pieces: list[Tracklet]) -> float:
-    """Visibility of a person: size times confidence, summed over time."""
+    """Returns the visibility of a person: size times confidence, summed over time."""
     return sum(height(p) * float(p[:, 2].sum()) for t in pieces for p in t.points)

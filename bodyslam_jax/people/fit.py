@@ -1,11 +1,11 @@
-"""Bodies from keypoints alone, in the manner of SMPLify, over a whole clip.
+"""Fits bodies to keypoints alone, in the manner of SMPLify, over a whole clip.
 
-Bogo et al., Keep it SMPL, ECCV 2016, fits each image by itself. Here every few frames
-are (`frame_fit`), then all frames of a person are fitted together, with one shape and
-a prior on human motion (`trajectory_fit`). **The metric scale comes from the prior on
-stature**: with β near the mean the depth is that of an adult of average size, so depths
-have a relative error of the stature's, 4 to 6 % (1 σ) for adults, and of the focal
-length's.
+Bogo et al., Keep it SMPL, ECCV 2016, fits each image independently. Here that is done
+for every few frames (`frame_fit`), then all frames of a person are fitted together,
+with one shape and a prior on human motion (`trajectory_fit`). **The metric scale comes
+from the prior on stature**: with β near the mean the depth is that of an adult of
+average size, so depths have the relative error of the stature, 4 to 6 % (1 σ) for
+adults, and that of the focal length.
 """
 
 import logging
@@ -34,8 +34,8 @@ from bodyslam_jax.people.keypoint_errors import (
 )
 from bodyslam_jax.people.lift import lift, load_lifter
 from bodyslam_jax.people.person_state import (
-    DEPTH_JITTER,
-    POSITION_JITTER,
+    DEPTH_JITTER_M,
+    POSITION_JITTER_M,
     PersonState,
     bodies_from_roots,
 )
@@ -46,20 +46,20 @@ from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
 log = logging.getLogger(__name__)
 
-_START_INTERVAL = 0.1
-"""Time between the frames that are fitted by themselves, s."""
-_MOST_STEPS = 30
-"""Gauss-Newton steps over all frames."""
+_START_INTERVAL_S = 0.1
+"""Time between the frames that are fitted independently."""
+_MAX_STEPS = 30
+"""Number of Gauss--Newton steps over all frames."""
 _LEAN_SIGMA = 0.4
-"""Standard deviation of the lean towards or from the camera, sine of the angle."""
-_TURN_JITTER = 0.03
-"""Standard deviation of the orientation's second difference at 30 fps, rad."""
+"""Standard deviation of the lean towards or away from the camera, sine of the angle."""
+_TURN_JITTER_RAD = 0.03
+"""Standard deviation of the orientation's second difference at 30 fps."""
 _MOTION_SCALE = 2.0
 """Factor on the posture prior's innovations: people move less predictably than in the
 motion data."""
-_FASTEST = 8.0
-"""m/s across the line of sight, above which the trajectory is cut: faster than
-people run; assumes that fits 0.1 s apart err by well below 0.8 m across the view."""
+_MAX_SPEED_M_S = 8.0
+"""Speed across the line of sight above which the trajectory is cut: faster than people
+run, assuming that fits 0.1 s apart err by well below 0.8 m across the view."""
 
 
 def fit_bodies(
@@ -69,7 +69,7 @@ def fit_bodies(
     fps: float,
     settings: PeopleFit = PeopleFit(),
 ) -> Bodies:
-    """Fits posture, shape and place of every person to their keypoints.
+    """Fits posture, shape and position of every person to their keypoints.
 
     Confidences are relative to the person's own best ones, as their scale differs
     between detectors. A keypoint outside the image is extrapolated and not used.
@@ -107,7 +107,7 @@ def fit_bodies(
 def _decoded(
     prior: PosturePrior, latent: Float[np.ndarray, "t k"]
 ) -> Float[np.ndarray, "t 23 3"]:
-    """`PosturePrior.decode`, compiled for few lengths."""
+    """Returns `PosturePrior.decode`, compiled for few lengths."""
     longer = lengthened(latent, padded_length(len(latent)))
     return np.asarray(_decode(prior, longer))[: len(latent)]
 
@@ -122,7 +122,8 @@ def make_scene(
     settings: PeopleFit,
     definition: str = "unknown",
 ) -> Scene:
-    """`definition`: the detector's, one of `body.KEYPOINT_DEFINITIONS`."""
+    """Returns the data that all frames share; `definition` is the detector's, one of
+    `body.KEYPOINT_DEFINITIONS`."""
     dtype = body.joint_template.dtype
     number = lambda value: jnp.asarray(value, dtype)
     return Scene(
@@ -167,7 +168,7 @@ def _fit_person(
     dtype = scene.intrinsics.dtype
     length = padded_length(len(uv)) - len(uv)
     pad = lambda a, value: np.concatenate([a, np.full((length, *a.shape[1:]), value)])
-    # By NumPy: JAX would compile small programs for each length.
+    # NumPy is used because JAX would compile small programs for each length.
     last = lambda a: jnp.asarray(
         np.concatenate([a, np.repeat(np.asarray(a)[-1:], length, axis=0)])
     )
@@ -185,7 +186,7 @@ def _fit_person(
         jnp.asarray(max(1.0, evidence / settings.shape_frames), dtype),
     )
     chain = Chain(jax.tree.map(last, start), jnp.zeros(NUM_SHAPE, dtype))
-    chain, value = solve_chain(problem, chain, _MOST_STEPS)
+    chain, value = solve_chain(problem, chain, _MAX_STEPS)
     log.info("fitted %d frames, cost %.1f", len(uv), float(value))
     fit = jax.tree.map(lambda a: np.asarray(a)[: len(uv)], chain.fit)
     return fitted, Chain(fit, chain.shape)
@@ -198,11 +199,14 @@ def guess_postures(
     fps: float,
     trusted: bool = True,
 ) -> Lifted:
-    """The lifting network's posture of one person, in C. Standard deviations are
-    infinite where it has too few keypoints, and everywhere if not `trusted`."""
+    """Returns the lifting network's posture of one person, in C.
+
+    Standard deviations are infinite where it has too few keypoints, and everywhere if
+    not `trusted`.
+    """
     dtype = scene.intrinsics.dtype
     length = padded_length(len(uv)) - len(uv)
-    # Beyond the end the last frame stands still, as for frames beyond the first.
+    # Beyond the end the last frame is repeated, as the first one is before the start.
     last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
     numbers = (jnp.asarray(a, dtype) for a in (last(uv), last(sigma), fps))
     lifted, usable = lift(load_lifter(), scene.intrinsics, *numbers)
@@ -218,23 +222,24 @@ def _start(
     lifted: Lifted,
     fps: float,
 ) -> tuple[Fit, np.ndarray]:
-    """Fits of every few of the `usable` frames, interpolated to all frames.
+    """Fits every few of the `usable` frames and interpolates to all frames.
 
     **Returns:** the fits, and the frames at which the trajectory is cut.
     """
-    stride = max(1, round(_START_INTERVAL * fps))
+    stride = max(1, round(_START_INTERVAL_S * fps))
     chosen = np.unique(
         [usable[np.argmin(np.abs(usable - k))] for k in range(0, len(uv), stride)]
     )
     guess = jax.tree.map(lambda a: a[chosen], lifted)
     fit = fit_frames(scene, uv[chosen], sigma_px[chosen], guess)
     speed = np.linalg.norm(np.diff(fit.position[:, :2], axis=0), axis=1) * fps
-    broken = speed / np.maximum(np.diff(chosen), 1) > _FASTEST
+    broken = speed / np.maximum(np.diff(chosen), 1) > _MAX_SPEED_M_S
     return _interpolate(fit, chosen, broken, len(uv)), chosen[1:][broken]
 
 
 def _interpolate(fit: Fit, frame: np.ndarray, broken: np.ndarray, total: int) -> Fit:
-    """Between the fitted frames; across a break the earlier one."""
+    """Interpolates between the fitted frames; across a break the earlier one is
+    held."""
     wanted = np.arange(total)
     after = np.clip(np.searchsorted(frame, wanted), 1, max(len(frame) - 1, 1))
     after = np.minimum(after, len(frame) - 1)
@@ -254,7 +259,7 @@ def _interpolate(fit: Fit, frame: np.ndarray, broken: np.ndarray, total: int) ->
 
 
 def make_ties(prior: PosturePrior, cuts: np.ndarray, frames: int, fps: float) -> Ties:
-    """Temporal terms between frames; none crosses a cut.
+    """Returns the temporal terms between frames; none crosses a cut.
 
     The first frame of a track has the posture's stationary prior, the second the
     first-order autoregression; from the third on the terms are the full ones. Noise in
@@ -267,7 +272,7 @@ def make_ties(prior: PosturePrior, cuts: np.ndarray, frames: int, fps: float) ->
     size = 6 + len(a1)
     weight, c1, c2 = np.zeros((3, frames, size))
     jitter = (
-        np.array([_TURN_JITTER] * 3 + [POSITION_JITTER] * 2 + [DEPTH_JITTER])
+        np.array([_TURN_JITTER_RAD] * 3 + [POSITION_JITTER_M] * 2 + [DEPTH_JITTER_M])
         * (30 / fps) ** 1.5
     )
     loose = _MOTION_SCALE**2
@@ -278,7 +283,7 @@ def make_ties(prior: PosturePrior, cuts: np.ndarray, frames: int, fps: float) ->
         c1[first], c2[first] = 0.0, 0.0
         second = first + 1
         if second < frames:
-            # Velocity is free but not absurd: ten frames' worth of its changes.
+            # The prior on velocity is wide: the change over ten frames.
             weight[second, :6], c1[second, :6] = jitter**-2 / 100, -1.0
             weight[second, 6:], c1[second, 6:] = 1 / ((1 - lag**2) * loose), -lag
             c2[second] = 0.0

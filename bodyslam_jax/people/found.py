@@ -1,4 +1,5 @@
-"""All detections of people in a video, as BODY_25 keypoints with confidences."""
+"""Represents all detections of people in a video, as BODY_25 keypoints with
+confidences."""
 
 import dataclasses
 
@@ -9,23 +10,24 @@ from bodyslam_jax.people import blazepose
 from bodyslam_jax.people.detect import to_body25
 from bodyslam_jax.types import DetectedPeople
 
-AGREES = 0.12
-"""Distance of MoveNet's and BlazePose's ankle, and median of all keypoints, of the
-radius of the circle around a person, up to which they saw the same one."""
-_FOOT = 0.6
-"""Confidence of heels and toes, of their ankle's: they are 2 to 3 % of a person's
-height from where others see them, in the median."""
+MAX_DISAGREEMENT = 0.12
+"""Distance between MoveNet's and BlazePose's ankle, and median over all keypoints,
+relative to the radius of the circle around a person, up to which they show the same
+person."""
+_FOOT_CONFIDENCE_FACTOR = 0.6
+"""Confidence of heels and toes relative to that of their ankle: they are 2 to 3 % of a
+person's height from where other detectors put them, in the median."""
 _SCORES = (0.08, 0.15, 0.22, 0.30, 0.40, 0.50)
 _CONFIDENCES = (0.0, 0.1, 0.2, 0.5, 0.8, 1.0)
-_FEET = ((21, 19, 11, 15), (24, 22, 14, 16))
-"""BODY_25's heel, big toe and ankle, COCO's ankle, of both sides."""
+_FOOT_KEYPOINTS = ((21, 19, 11, 15), (24, 22, 14, 16))
+"""BODY_25's heel, big toe and ankle, and COCO's ankle, of both sides."""
 _WRISTS = [9, 10]
-"""Of COCO."""
+"""COCO's wrists."""
 _WRIST_POWER = 3
 """Exponent of a wrist's confidence. The network guesses a wrist behind the trunk, often
-at the place of the other wrist: on ten rendered sequences the error was 2.5 times that
-of a certain wrist at a confidence of 0.8, and 7 times at 0.5. Errors of other joints
-are about inverse to their confidence."""
+at the position of the other wrist: on ten rendered sequences the error was 2.5 times
+that of a certain wrist at a confidence of 0.8, and 7 times at 0.5. Errors of other
+joints are about inverse to their confidence."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,17 +36,17 @@ class Found:
 
     frame: Int[np.ndarray, " n"]
     points: Float[np.ndarray, "n 25 3"]
-    """BODY_25: u px, v px, confidence."""
+    """Keypoints of BODY_25: u px, v px, confidence."""
     person: Int[np.ndarray, " n"]
     """Number of the person, the most visible first; -1 for people who are only
     masked."""
     silhouettes: UInt8[np.ndarray, "t y x8"]
-    """Masks of people at every `step`-th pixel, eight to a byte."""
+    """Masks of people at every `step`-th pixel, eight pixels per byte."""
     warnings: tuple[str, ...]
 
     def by_frame(self, num_frames: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """For each frame the keypoints (n, 25, 3) of the numbered people, and their
-        numbers (n,)."""
+        """Returns for each frame the keypoints (n, 25, 3) of the numbered people, and
+        their numbers (n,)."""
         numbered = self.person >= 0
         frame, points, person = (
             a[numbered] for a in (self.frame, self.points, self.person)
@@ -53,20 +55,22 @@ class Found:
         return np.split(points, ends), np.split(person, ends)
 
     def detected(self) -> DetectedPeople:
-        """All detections, to be masked in the images."""
+        """Returns all detections, to be masked in the images."""
         return DetectedPeople(self.frame, self.points, self.silhouettes)
 
 
 def find_feet(
     pose: blazepose.Pose, points: Float[np.ndarray, "17 3"], apart: np.ndarray
 ) -> Float[np.ndarray, "4 3"]:
-    """Heel and big toe of both sides (u px, v px, confidence): nothing where the two
-    networks put the ankle elsewhere."""
+    """Returns heel and big toe of both sides (u px, v px, confidence), with confidence
+    0 where the two networks disagree on the ankle."""
     feet = pose.landmarks[blazepose.HEELS_AND_TOES].copy()
     sure = confidence(points[:, 2])
-    for side, (_, _, _, ankle) in enumerate(_FEET):
+    for side, (_, _, _, ankle) in enumerate(_FOOT_KEYPOINTS):
         rows = slice(2 * side, 2 * side + 2)
-        share = _FOOT * sure[ankle] * (apart[ankle] < AGREES)
+        share = (
+            _FOOT_CONFIDENCE_FACTOR * sure[ankle] * (apart[ankle] < MAX_DISAGREEMENT)
+        )
         feet[rows, 2] *= share
     return feet
 
@@ -74,22 +78,22 @@ def find_feet(
 def as_body25(
     points: Float[np.ndarray, "17 3"], feet: Float[np.ndarray, "4 3"] | None
 ) -> Float[np.ndarray, "25 3"]:
-    """BODY_25 from MoveNet's keypoints, and what `find_feet` found."""
+    """Returns BODY_25 from MoveNet's keypoints and the output of `find_feet`."""
     sure = confidence(points[:, 2])
     sure[_WRISTS] **= _WRIST_POWER
     found = to_body25(np.column_stack([points[:, :2], sure]))
     if feet is not None:
-        for side, (heel, toe, _, _) in enumerate(_FEET):
+        for side, (heel, toe, _, _) in enumerate(_FOOT_KEYPOINTS):
             found[heel], found[toe] = feet[2 * side], feet[2 * side + 1]
         found[found[:, 2] <= 0] = 0.0
     return found
 
 
 def confidence(score: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """MoveNet's score as a confidence in 0..1 that is inverse to the error.
+    """Converts MoveNet's score to a confidence in 0..1 that is inverse to the error.
 
-    Errors against six clips' other keypoints, two of them rendered, 1.0 % of a person's
-    height in the median from a score of 0.45 on, 1.4 to 1.9 % at 0.35, 2.2 % at 0.27
-    with one in five gross, 4 to 9 % at 0.2.
+    Errors relative to six clips' other keypoints, two of them rendered, are 1.0 % of a
+    person's height in the median from a score of 0.45 on, 1.4 to 1.9 % at 0.35, 2.2 %
+    at 0.27 with one in five gross, 4 to 9 % at 0.2.
     """
     return np.interp(score, _SCORES, _CONFIDENCES)

@@ -1,8 +1,8 @@
-"""Fits of single frames to keypoints, from the lifted posture.
+"""Fits bodies to the keypoints of single frames, starting from the lifted posture.
 
-Each starts at what the lifting network (`lift`) says, placed by the keypoints, and is
-the start of the fit of all frames (`fit`). Other headings and typical postures end at
-the same bodies (`benchmarks/keypoints.md`).
+Each fit starts at the output of the lifting network (`lift`), placed by the keypoints,
+and is the start of the fit of all frames (`fit`). Other headings and typical postures
+converge to the same bodies (`benchmarks/keypoints.md`).
 """
 
 from typing import Any
@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from bodyslam_jax.geometry.camera import unproject
-from bodyslam_jax.people.costs import DEPTH_FLOOR, Fit, Lifted, Scene, linearise
+from bodyslam_jax.people.costs import MIN_DEPTH_M, Fit, Lifted, Scene, linearise
 from bodyslam_jax.people.skeleton import NUM_SHAPE, place_points
 
-_STEPS = 15
-_BATCH = 64
+_NUM_STEPS = 15
+_BATCH_FRAMES = 64
 
 
 def fit_frames(
@@ -26,13 +26,15 @@ def fit_frames(
     uv: Float[np.ndarray, "f 25 2"],
     sigma: Float[np.ndarray, "f 25"],
     lifted: Lifted,
-    steps: int = _STEPS,
+    steps: int = _NUM_STEPS,
 ) -> Fit:
-    """Fits each frame by itself, β = 0; NumPy."""
+    """Fits each frame independently, with β = 0; returns NumPy arrays."""
     parts, dtype, limit = [], scene.intrinsics.dtype, jnp.asarray(steps)
-    for first in range(0, len(uv), _BATCH):
-        # The last batch is filled up: one shape to compile, whatever their number.
-        rows = np.resize(np.arange(first, min(first + _BATCH, len(uv))), _BATCH)
+    for first in range(0, len(uv), _BATCH_FRAMES):
+        # The last batch is padded, so that one shape is compiled for any number.
+        rows = np.resize(
+            np.arange(first, min(first + _BATCH_FRAMES, len(uv))), _BATCH_FRAMES
+        )
         batch = jax.tree.map(lambda a: jnp.asarray(a[rows], dtype), (uv, sigma, lifted))
         parts.append(_descend(scene, limit, *batch))
     return jax.tree.map(lambda *p: np.concatenate(p)[: len(uv)], *parts)
@@ -46,7 +48,8 @@ def _descend(
     sigma: Float[Array, "m 25"],
     lifted: Lifted,
 ) -> Fit:
-    """Levenberg--Marquardt from each of `m` guesses, all the same number of steps."""
+    """Runs Levenberg--Marquardt from each of `m` initial postures, with the same number
+    of steps for all."""
     fits = jax.vmap(first_fit, in_axes=(None, 0, 0, 0))(scene, uv, sigma, lifted)
     shape = jnp.zeros(NUM_SHAPE, uv.dtype)
     size = 6 + fits.latent.shape[-1]
@@ -75,7 +78,7 @@ def _descend(
         fits, normal = jax.tree.map(choose, (proposal, found), (fits, normal))
         return fits, normal, jnp.where(better, damping / 5, damping * 5)
 
-    # The first normal equations are those of a step that is always accepted.
+    # The first step is always accepted, because its cost is compared with infinity.
     blank = (
         jnp.tile(jnp.eye(size, dtype=uv.dtype), (len(uv), 1, 1)),
         jnp.zeros((len(uv), size), uv.dtype),
@@ -91,7 +94,7 @@ def first_fit(
     sigma: Float[Array, " 25"],
     lifted: Lifted,
 ) -> Fit:
-    """The lifted posture, placed by the keypoints."""
+    """Returns the lifted posture, placed by the keypoints."""
     shape = jnp.zeros(NUM_SHAPE, uv.dtype)
     angles = scene.prior.angles(lifted.latent)
     _, points = place_points(scene.skeleton, angles, shape)
@@ -103,7 +106,8 @@ def first_fit(
 def _place(
     points: Float[Array, "25 3"], rays: Float[Array, "25 3"], sigma: Float[Array, " 25"]
 ) -> Float[Array, " 3"]:
-    """The translation that puts points on rays best, by linear least squares."""
+    """Returns the translation that best puts points on rays, by linear least
+    squares."""
     weight = 1 / sigma**2
     weight = weight / jnp.maximum(jnp.max(weight), jnp.finfo(weight.dtype).tiny)
     x, y = rays[:, 0], rays[:, 1]
@@ -117,6 +121,6 @@ def _place(
     weight = jnp.concatenate([weight, weight])
     normal = (rows * weight[:, None]).T @ rows + 1e-9 * jnp.eye(3, dtype=x.dtype)
     found = jnp.linalg.solve(normal, rows.T @ (weight * right))
-    # A negative or tiny depth means points that no body of this posture makes.
-    depth = jnp.maximum(found[2], 2 * DEPTH_FLOOR)
+    # A negative or tiny depth means points that no body in this posture has.
+    depth = jnp.maximum(found[2], 2 * MIN_DEPTH_M)
     return jnp.where(found[2] < depth, depth * rays[8], found)

@@ -1,14 +1,16 @@
-"""Frames in which the other of two readings is true: a hidden Markov model.
+"""Detects frames in which the second of two hypotheses is true, by a hidden Markov
+model.
 
 - A detector processes single images, and may exchange left and right limbs: of people
   seen from behind, and where legs cross in a view from the side (`correct_left_right`).
-- A regressor may take front for back (`find_turned`).
+- A regressor may confuse front and back (`find_turned`).
 
-A reading is a state of the model. Each puts points (joints, limbs about the middle of
-both sides) somewhere; these move at nearly constant velocity, so that where legs cross,
-each goes on and none turns back. A Kalman filter follows them under several hypotheses
-of the last readings; of those that agree in the last frames the most likely one is kept
-(a Viterbi algorithm whose states are the last `_REMEMBERED` readings).
+A hypothesis on one frame is a state of the model. Each determines positions of points
+(joints, or limbs relative to the middle of both sides) that move at nearly constant
+velocity, so that legs which cross continue their motion instead of turning back. A
+Kalman filter follows the points for several sequences of recent states; among sequences
+with the same states in the last frames the most likely one is kept (a Viterbi algorithm
+whose states are the last `_HYPOTHESIS_FRAMES` states).
 """
 
 import dataclasses
@@ -17,49 +19,51 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bodyslam_jax.people.keypoint_errors import BOX_DIAGONAL
+from bodyslam_jax.people.keypoint_errors import BOX_DIAGONAL_M
 from bodyslam_jax.types import Keypoints
 
 ARMS = ((2, 5), (3, 6), (4, 7))
 """Shoulders, elbows, wrists of BODY_25: right and left."""
 LEGS = ((9, 12), (10, 13), (11, 14), (22, 19), (23, 20), (24, 21))
-"""Hips, knees, ankles, big toes, small toes, heels."""
-_LIMBS = (1, 2, 4, 5, 7, 8, *range(16, 22))
-"""SMPL's hips, knees, ankles, shoulders, elbows and wrists, which a turned body has
-elsewhere."""
-_RARE, _LASTS = 13.5, 1.0
-"""-log odds of an error a second (frames closer than 1/30 s are alike), and of a change
-between error and none from frame to frame."""
-_INDEPENDENT = 0.5
-"""Weight of each point's evidence, as points of a limb move together."""
-_NOISE = 0.045
-"""m: standard deviation of a coordinate of a keypoint, or of a joint of a regressor: as
-of gross errors, since those of successive frames are alike."""
-_ACCELERATION = 3.5
+"""Hips, knees, ankles, big toes, small toes, heels of BODY_25: right and left."""
+_LIMB_JOINTS = (1, 2, 4, 5, 7, 8, *range(16, 22))
+"""SMPL's hips, knees, ankles, shoulders, elbows and wrists, whose positions change if a
+body is rotated by π."""
+_ERROR_COST, _CHANGE_COST = 13.5, 1.0
+"""Negative log odds of an error per second (frames closer than 1/30 s count alike), and
+of a change between error and no error from frame to frame."""
+_POINT_WEIGHT = 0.5
+"""Weight of each point's evidence, below 1 because points of a limb move together."""
+_POSITION_SIGMA_M = 0.045
+"""Standard deviation of a coordinate of a keypoint, or of a regressor's joint. It is
+that of gross errors, since errors of successive frames are correlated."""
+_ACCELERATION_DENSITY = 3.5
 """Square root of the spectral density of the points' acceleration, m/s^1.5. In eleven
 rendered sequences 18 of 69 frames keep exchanged legs and 14 of 34 arms, in twenty of
 simulated keypoints 2 of 11 and 10 of 6; with 5 it is 20 and 23, 2 and 6."""
-_FORGOTTEN = 0.5
-"""Time constant with which velocities decay, s: so they stay bounded across gaps."""
-_GATE = 5.0
-"""Standard deviations beyond which an innovation is an outlier: it costs as much as one
-at this bound, and the filter is not updated with it."""
-_REMEMBERED = 5
-"""Hypotheses with the same readings in this number of last frames are merged: the most
+_VELOCITY_DECAY_S = 0.5
+"""Time constant with which velocities decay, which bounds them across gaps."""
+_GATE_SIGMAS = 5.0
+"""Standard deviations beyond which an innovation is an outlier: its cost is that at
+this bound, and it does not update the filter."""
+_HYPOTHESIS_FRAMES = 5
+"""Hypotheses with the same states in this number of last frames are merged: the most
 likely one is kept."""
-_LASTING = 1 / 3
-"""s: correlation time of errors of keypoints against a posture: frames within it count
+_ERROR_CORRELATION_S = 1 / 3
+"""Correlation time of errors of keypoints against a posture: frames within it count
 once."""
-_ALL_WRONG = 8.0
-"""-log odds that all keypoints of a frame are wrong: bounds a frame's evidence."""
-_MEDIAN_OF_TWO = 1.386
-"""Median squared length of a vector with two normal components of deviation 1."""
+_MAX_FRAME_COST = 8.0
+"""Negative log odds that all keypoints of a frame are wrong, which bounds a frame's
+evidence."""
+_MEDIAN_SQUARED_NORM = 1.386
+"""Median squared norm of a vector with two standard normal components."""
 
 
 def correct_left_right(
     keypoints: Keypoints, fps: float
 ) -> tuple[Keypoints, Bool[np.ndarray, "h t 2"]]:
-    """Keypoints with exchanges undone; where arms (0) and legs (1) were exchanged."""
+    """Returns the keypoints with exchanges undone, and where arms (0) and legs (1) were
+    exchanged."""
     uv, confidence = keypoints.uv.copy(), keypoints.confidence.copy()
     renamed = np.zeros((*confidence.shape[:2], 2), bool)
     for h in range(len(uv)):
@@ -84,17 +88,19 @@ def find_turned(
     sigma: Float[np.ndarray, "f 25"],
     robust_scale: float,
 ) -> Bool[np.ndarray, " f"]:
-    """Frames whose body is to be rotated by π about its own vertical axis.
+    """Returns the frames whose body must be rotated by π about its own vertical axis.
 
     Args:
-        joints: of the body as given, and turned, about the pelvis in C, m.
-        time: of each frame, s, increasing.
-        predicted: keypoints of both, px.
+        joints: joints of the body as given, and rotated, relative to the pelvis in C,
+            m.
+        time: time of each frame, s, increasing.
+        predicted: keypoints of both bodies, px.
         uv: the detector's keypoints, px.
         sigma: assumed standard deviation, px; `inf` for missing keypoints.
-        robust_scale: of Geman and McClure's loss on keypoints, in deviations.
+        robust_scale: scale of Geman and McClure's loss on keypoints, in standard
+            deviations.
     """
-    seconds = float(np.median(np.diff(time))) if len(time) > 1 else _LASTING
+    seconds = float(np.median(np.diff(time))) if len(time) > 1 else _ERROR_CORRELATION_S
     robust = lambda squared: squared / (1 + squared / robust_scale**2)
     detected = np.isfinite(sigma)
     squared = np.sum((predicted - uv[:, None]) ** 2, -1) / sigma[:, None] ** 2
@@ -102,11 +108,11 @@ def find_turned(
     if detected.any():
         better = np.argmin(robust(squared).sum(-1), axis=1)
         residual = squared[np.arange(len(uv)), better][detected]
-        noise = max(1.0, float(np.median(residual)) / _MEDIAN_OF_TWO)
+        noise = max(1.0, float(np.median(residual)) / _MEDIAN_SQUARED_NORM)
         costs = 0.5 * robust(squared / noise).sum(-1)
-        costs = np.minimum(costs - costs.min(axis=1, keepdims=True), _ALL_WRONG)
-    costs *= min(1.0, seconds / _LASTING)
-    return are_errors(costs, joints[:, :, _LIMBS], time, _NOISE)
+        costs = np.minimum(costs - costs.min(axis=1, keepdims=True), _MAX_FRAME_COST)
+    costs *= min(1.0, seconds / _ERROR_CORRELATION_S)
+    return are_errors(costs, joints[:, :, _LIMB_JOINTS], time, _POSITION_SIGMA_M)
 
 
 def _exchanged(
@@ -115,11 +121,12 @@ def _exchanged(
     pairs: tuple[tuple[int, int], ...],
     fps: float,
 ) -> Bool[np.ndarray, " t"]:
-    """Frames in which the labels of these pairs of one person are exchanged: limbs are
-    on the other side of the middle between left and right."""
-    metre = _size(uv, detected) / BOX_DIAGONAL
-    # Hips and shoulders are close together in a view from the side: no further than
-    # the error of a keypoint.
+    """Returns the frames in which the labels of these pairs of one person are
+    exchanged, that is, in which limbs are on the other side of the middle between left
+    and right."""
+    metre = _size(uv, detected) / BOX_DIAGONAL_M
+    # Hips and shoulders are left out: from the side they are no further apart than the
+    # error of a keypoint.
     first, second = np.array(pairs[1:]).T
     seen = detected[:, first] & detected[:, second]
     if metre == 0 or not seen.any():
@@ -127,8 +134,8 @@ def _exchanged(
     across = np.where(seen[..., None], uv[:, first] - uv[:, second], 0.0)
     places = np.stack([across, -across], axis=1) / (2 * metre)
     time = np.arange(len(uv)) / fps
-    # 1 px is the error of a vector assumed of any detector in images of any size.
-    noise = math.hypot(_NOISE, 1 / (2 * metre))
+    # 1 px is the least error of a vector between keypoints that is assumed.
+    noise = math.hypot(_POSITION_SIGMA_M, 1 / (2 * metre))
     return are_errors(np.zeros((len(uv), 2)), places, time, noise, seen)
 
 
@@ -139,44 +146,47 @@ def are_errors(
     noise: float,
     seen: Bool[np.ndarray, "f n"] | None = None,
 ) -> Bool[np.ndarray, " f"]:
-    """Frames whose second reading is true, so that what was given is an error.
+    """Returns the frames in which the second hypothesis is true, so that the input is
+    an error.
 
     Args:
-        costs: -log likelihood of both readings by the frame itself.
-        places: of the `n` points in both, m.
-        time: of each frame, s, increasing.
+        costs: negative log likelihood of both hypotheses by the frame itself.
+        places: positions of the `n` points under both, m.
+        time: time of each frame, s, increasing.
         noise: standard deviation of the points' coordinates, m.
-        seen: points that are known; all of them without it.
+        seen: points that are known; by default all.
     """
     frames, _, points, axes = places.shape
     seen = np.ones((frames, points), bool) if seen is None else seen
-    # Axes: hypotheses, points, (place, velocity), coordinates.
+    # Axes: sequences, points, (position, velocity), coordinates.
     mean = np.zeros((1, points, 2, axes))
-    usual = _ACCELERATION**2 * _FORGOTTEN / 2
+    usual = _ACCELERATION_DENSITY**2 * _VELOCITY_DECAY_S / 2
     covariance = np.tile(np.diag([1.0, usual]), (1, points, 1, 1))
     cost, labels, steps = np.zeros(1), np.zeros(1, int), []
     for k, dt in enumerate(np.diff(time, prepend=time[0])):
-        move = np.array([[1.0, dt], [0.0, np.exp(-dt / _FORGOTTEN)]])
+        move = np.array([[1.0, dt], [0.0, np.exp(-dt / _VELOCITY_DECAY_S)]])
         spread = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
         mean = move @ mean
-        covariance = move @ covariance @ move.T + _ACCELERATION**2 * spread
+        covariance = move @ covariance @ move.T + _ACCELERATION_DENSITY**2 * spread
         variance = covariance[..., 0, 0] + noise**2
-        # Each hypothesis is continued with both readings: axes are hypotheses,
-        # readings, points, coordinates.
+        # Each sequence is continued with both states: axes are sequences, states,
+        # points, coordinates.
         innovation = places[k] - mean[:, None, :, 0]
         away = (innovation**2).sum(-1) / variance[:, None]
-        near = seen[k] & (away < _GATE**2)
-        paid = (seen[k] * np.minimum(away, _GATE**2)).sum(-1) * _INDEPENDENT / 2
-        prior = np.array([0.0, _RARE * min(dt, 1 / 30) if k else _RARE / 30])
+        near = seen[k] & (away < _GATE_SIGMAS**2)
+        paid = (seen[k] * np.minimum(away, _GATE_SIGMAS**2)).sum(-1) * _POINT_WEIGHT / 2
+        prior = np.array(
+            [0.0, _ERROR_COST * min(dt, 1 / 30) if k else _ERROR_COST / 30]
+        )
         changed = ((labels[:, None] & 1) != np.arange(2)) & (k > 0)
-        total = cost[:, None] + paid + costs[k] + prior + _LASTS * changed
+        total = cost[:, None] + paid + costs[k] + prior + _CHANGE_COST * changed
         gain = (covariance[..., 0] / variance[..., None])[:, None] * near[..., None]
         means = mean[:, None] + gain[..., None] * innovation[..., None, :]
         covariances = (
             covariance[:, None]
             - gain[..., None] * covariance[:, None, :, 0][..., None, :]
         )
-        longer = (labels[:, None] << 1 | np.arange(2)) % 2**_REMEMBERED
+        longer = (labels[:, None] << 1 | np.arange(2)) % 2**_HYPOTHESIS_FRAMES
         kept = _cheapest_of_each(longer.ravel(), total.ravel())
         flat = lambda x: x.reshape(-1, *x.shape[2:])[kept]
         mean, covariance, cost, labels = map(flat, (means, covariances, total, longer))
@@ -191,13 +201,14 @@ def are_errors(
 def _cheapest_of_each(
     group: Int[np.ndarray, " n"], cost: Float[np.ndarray, " n"]
 ) -> Int[np.ndarray, " g"]:
-    """The index of the cheapest member of each group."""
+    """Returns the index of the cheapest member of each group."""
     order = np.lexsort((cost, group))
     return order[np.unique(group[order], return_index=True)[1]]
 
 
 def _size(uv: Float[np.ndarray, "t 25 2"], detected: Bool[np.ndarray, "t 25"]) -> float:
-    """Of the person in the image, px: the usual box of the keypoints."""
+    """Returns the size of the person in the image, px: the median diagonal of the box
+    around the keypoints."""
     valid = detected[..., None]
     low = np.where(valid, uv, np.inf).min(axis=1)
     high = np.where(valid, uv, -np.inf).max(axis=1)

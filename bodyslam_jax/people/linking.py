@@ -1,8 +1,8 @@
-"""Tracklets -> people: re-identification after an occlusion or absence.
+"""Links tracklets to people: re-identification after an occlusion or absence.
 
-Offline, tracklets are cut where their colours change (`crossings`), and a piece that
-ends and a later one that begins are joined if position, size and colours of clothes
-agree. Of all ways to join them, the one of least total cost is taken.
+Tracklets are cut where their colours change (`crossings`), and a piece that ends is
+joined to a later one that begins if position, size and colours of clothes agree. Of all
+ways to join them, the one with the least total cost is chosen.
 """
 
 from itertools import pairwise
@@ -14,36 +14,37 @@ from bodyslam_jax.people.appearance import difference, mean_look
 from bodyslam_jax.people.crossings import chosen, cut, part
 from bodyslam_jax.people.regions import behind
 from bodyslam_jax.people.tracking import (
-    AWHILE,
-    GROWTH,
+    LONG_GAP_FRAMES,
+    MAX_SIZE_RATIO,
     Tracklet,
     displacement,
     height,
 )
 
-_NEAR = 1.0
-"""s: gaps up to which the position in the image is compared."""
-_REACH = 0.2
-"""Gate on the distance from the predicted position, of the person's height."""
-_REACH_PER_SECOND = 1.2
-_SAME_CLOTHES = 14.0
+_SHORT_GAP_S = 1.0
+"""Gap up to which the position in the image is compared."""
+_GATE_HEIGHTS = 0.2
+"""Gate on the distance from the predicted position, relative to the person's height in
+the image."""
+_GATE_GROWTH_HEIGHTS_PER_S = 1.2
+_MAX_COLOUR_DIFFERENCE = 14.0
 """Difference of colours up to which a person after a long gap is the same."""
-_CLOTHES_NEARBY = 22.0
+_MAX_NEARBY_COLOUR_DIFFERENCE = 22.0
 """The same after a short gap, where the position agrees too."""
-_JUMP = 3.0
-"""Distance, of the height, over which a detector may go from one person to another;
-beyond it somebody left, and somebody came."""
-_GROWTH = 2.0
-"""Ratio of sizes before and after from which it is somebody else."""
-_ENDS = 20
-"""Frames at the end of a piece over which size is averaged."""
+_MAX_JUMP_HEIGHTS = 3.0
+"""Distance, relative to the height, over which a detector may switch from one person to
+another; beyond it somebody left and somebody else came."""
+_MAX_LONG_GAP_SIZE_RATIO = 2.0
+"""Ratio of sizes before and after a long gap from which it is somebody else."""
+_END_FRAMES = 20
+"""Number of frames at the end of a piece over which its size is averaged."""
 
 
 def link(tracklets: list[Tracklet], fps: float) -> list[list[Tracklet]]:
-    """People, each as the pieces of them in order of time.
+    """Returns the people, each as a list of pieces in order of time.
 
-    Pieces of one tracklet that are one person's again are that tracklet, or the part of
-    it from the first of them to the last.
+    Successive pieces of one tracklet that belong to the same person are merged into the
+    original tracklet, or its part from the first piece to the last.
     """
     tracklets = without_fragments(tracklets, fps)
     pieces = [piece for t in tracklets for piece in cut(t, fps)]
@@ -75,12 +76,13 @@ def link(tracklets: list[Tracklet], fps: float) -> list[list[Tracklet]]:
 
 
 def without_fragments(tracklets: list[Tracklet], fps: float) -> list[Tracklet]:
-    """The tracklets without detections that only a part of somebody else explains.
+    """Returns the tracklets without detections that only a part of another person
+    explains.
 
-    After a gap a track goes on with whoever is found near the expected place; that may
-    be the limbs of a person who is found whole only afterwards, when a new track is
-    followed backwards. Such detections, mostly covered by a surer one of another track,
-    would be two people at one place at one time.
+    After a gap a track continues with whoever is found near the expected position;
+    these may be limbs of a person who is detected completely only later, when a new
+    track is followed backwards. Such detections, mostly covered by a more confident one
+    of another track, would be two people at one place at one time.
     """
     at: dict[int, list[tuple[int, np.ndarray]]] = {}
     for t in tracklets:
@@ -93,10 +95,17 @@ def _without_fragments(
     tracklet: Tracklet, at: dict[int, list[tuple[int, np.ndarray]]], fps: float
 ) -> Tracklet:
     kept = list(range(len(tracklet.frames)))
-    ends = [i for i, (a, b) in enumerate(pairwise(tracklet.frames)) if b - a > AWHILE]
+    ends = [
+        i
+        for i, (a, b) in enumerate(pairwise(tracklet.frames))
+        if b - a > LONG_GAP_FRAMES
+    ]
     for i in ends:
         for j in range(i + 1, len(tracklet.frames)):
-            if j > i + 1 and tracklet.frames[j] - tracklet.frames[j - 1] > AWHILE:
+            if (
+                j > i + 1
+                and tracklet.frames[j] - tracklet.frames[j - 1] > LONG_GAP_FRAMES
+            ):
                 break
             others = [
                 points
@@ -110,7 +119,7 @@ def _without_fragments(
 
 
 def _is_part(points: np.ndarray, others: list[np.ndarray]) -> bool:
-    """Whether a detection is mostly covered by a surer one."""
+    """Returns whether a detection is mostly covered by a more confident one."""
     if not others:
         return False
     every = np.stack([points, *others])
@@ -118,8 +127,9 @@ def _is_part(points: np.ndarray, others: list[np.ndarray]) -> bool:
 
 
 def remarks(people: list[list[Tracklet]], fps: float, max_gap: float) -> list[str]:
-    """Warnings: people re-identified after a gap of more than `max_gap` seconds, and
-    people who are not, although another was lost nearby just before."""
+    """Returns warnings about people re-identified after a gap of more than `max_gap`
+    seconds, and about people who were not, although another was lost nearby just
+    before."""
     found = []
     for number, pieces in enumerate(people):
         for a, b in pairwise(pieces):
@@ -136,7 +146,7 @@ def remarks(people: list[list[Tracklet]], fps: float, max_gap: float) -> list[st
                 continue
             frame = first.frames[0]
             away = displacement(others[-1].expected(frame, fps), first.points[0])
-            if away > _JUMP:
+            if away > _MAX_JUMP_HEIGHTS:
                 continue
             where = f"{away:.1f} of their height away"
             found.append(
@@ -147,32 +157,35 @@ def remarks(people: list[list[Tracklet]], fps: float, max_gap: float) -> list[st
 
 
 def join_cost(a: Tracklet, b: Tracklet, fps: float) -> float:
-    """0 where `b` certainly continues `a`, 1 and more where it does not."""
+    """Returns the cost of joining two pieces: 0 where `b` certainly continues `a`, 1
+    and more where it does not."""
     gap = b.frames[0] - a.frames[-1]
     if gap <= 0:
         return np.inf
     looks = difference(mean_look(np.stack(a.looks)), mean_look(np.stack(b.looks)))
     growth = abs(np.log(_size(a, last=True) / _size(b, last=False)))
     seconds = gap / fps
-    growth /= np.log(_GROWTH if seconds > _NEAR else GROWTH)
-    if seconds > _NEAR:
-        clothes = looks / _SAME_CLOTHES if np.isfinite(looks) else np.inf
+    growth /= np.log(
+        _MAX_LONG_GAP_SIZE_RATIO if seconds > _SHORT_GAP_S else MAX_SIZE_RATIO
+    )
+    if seconds > _SHORT_GAP_S:
+        clothes = looks / _MAX_COLOUR_DIFFERENCE if np.isfinite(looks) else np.inf
         return float(max(clothes, growth)) if max(clothes, growth) < 1 else np.inf
     place = displacement(a.expected(b.frames[0], fps), b.points[0])
-    place /= _REACH + _REACH_PER_SECOND * seconds
-    clothes = looks / _CLOTHES_NEARBY if np.isfinite(looks) else 0.5
+    place /= _GATE_HEIGHTS + _GATE_GROWTH_HEIGHTS_PER_S * seconds
+    clothes = looks / _MAX_NEARBY_COLOUR_DIFFERENCE if np.isfinite(looks) else 0.5
     worst = max(place, clothes, growth)
     return float(0.5 * place + 0.5 * clothes) if worst < 1 else np.inf
 
 
 def _cost_to_go_on(a: Tracklet, b: Tracklet) -> float:
-    """Cost of joining two successive pieces of one tracklet, whose positions and sizes
-    agree: others may explain them better, but a change of light also changes colours.
-    """
+    """Returns the cost of joining two successive pieces of one tracklet, whose
+    positions and sizes agree: others may explain them better, but a change of light
+    also changes colours."""
     looks = difference(mean_look(np.stack(a.looks)), mean_look(np.stack(b.looks)))
-    return 0.5 * looks / _CLOTHES_NEARBY
+    return 0.5 * looks / _MAX_NEARBY_COLOUR_DIFFERENCE
 
 
 def _size(tracklet: Tracklet, *, last: bool) -> float:
-    points = tracklet.points[-_ENDS:] if last else tracklet.points[:_ENDS]
+    points = tracklet.points[-_END_FRAMES:] if last else tracklet.points[:_END_FRAMES]
     return float(np.median([height(p) for p in points]))

@@ -13,12 +13,12 @@ from jaxtyping import Float, UInt8
 
 from bodyslam_jax.config import Association, Detect
 from bodyslam_jax.people import blazepose, movenet
-from bodyslam_jax.people.appearance import SIZE, describe, difference
-from bodyslam_jax.people.found import AGREES, as_body25, find_feet
-from bodyslam_jax.people.movenet import SURE, sure_points
+from bodyslam_jax.people.appearance import DESCRIPTOR_SIZE, describe, difference
+from bodyslam_jax.people.found import MAX_DISAGREEMENT, as_body25, find_feet
+from bodyslam_jax.people.movenet import MIN_SURE_SCORE, sure_points
 from bodyslam_jax.people.networks import BLAZEPOSE, MOVENET, open_network
 from bodyslam_jax.people.regions import behind, regions
-from bodyslam_jax.people.tracking import OTHER_CLOTHES, Tracker, height
+from bodyslam_jax.people.tracking import MAX_COLOUR_DIFFERENCE, Tracker, height
 
 _INTERVAL, _SELDOM = 0.33, 1.0
 """s between two searches of the whole image: without anybody, and with."""
@@ -31,7 +31,7 @@ _MOST = 4
 _PRESENCE = 0.5
 _LASTS = 0.2
 """s: shorter tracks are nobody."""
-_SAME_CLOTHES = 0.6 * OTHER_CLOTHES
+_SAME_CLOTHES = 0.6 * MAX_COLOUR_DIFFERENCE
 """Difference of colours below which somebody who returns is the same person."""
 _SOON = 5.0
 """s after which somebody whose clothes are not seen is somebody else."""
@@ -93,8 +93,8 @@ class LivePeople:
         points, score = points[kept], score[kept]
         large = np.array([height(p) >= self.settings.min_height for p in points], bool)
         points, score = points[large], score[large]
-        looks = [describe(image, p, SURE) for p in points]
-        looks = np.array(looks).reshape(-1, SIZE)
+        looks = [describe(image, p, MIN_SURE_SCORE) for p in points]
+        looks = np.array(looks).reshape(-1, DESCRIPTOR_SIZE)
         clear = ~behind(points, score)
         who = self._track(points, looks, clear, clear & (score >= _START))
         return {person: self._whole(image, points[row]) for row, person in who.items()}
@@ -108,10 +108,10 @@ class LivePeople:
         points = keypoints[:, _COCO]
         some = np.array([sure_points(p).sum() >= 3 for p in points], bool)
         rows = np.flatnonzero(some)
-        looks = np.full((len(rows), SIZE), np.nan)
+        looks = np.full((len(rows), DESCRIPTOR_SIZE), np.nan)
         if image is not None:
-            found = [describe(image, points[row], SURE) for row in rows]
-            looks = np.array(found).reshape(-1, SIZE)
+            found = [describe(image, points[row], MIN_SURE_SCORE) for row in rows]
+            looks = np.array(found).reshape(-1, DESCRIPTOR_SIZE)
         every = np.ones(len(rows), bool)
         who = self._track(points[rows], looks, every, every)
         return {person: keypoints[rows[row]] for row, person in who.items()}
@@ -129,12 +129,15 @@ class LivePeople:
     ) -> Float[np.ndarray, "25 3"]:
         """BODY_25 with the feet that BlazePose sees."""
         assert self.networks is not None
-        square = blazepose.turned_square(points, SURE)
+        square = blazepose.turned_square(points, MIN_SURE_SCORE)
         if square is None:
             return as_body25(points, None)
         pose = blazepose.read_pose(self.networks[1], image, square)
         apart = blazepose.disagreement(pose, points)
-        if pose.presence < _PRESENCE or np.median(apart[sure_points(points)]) > AGREES:
+        if (
+            pose.presence < _PRESENCE
+            or np.median(apart[sure_points(points)]) > MAX_DISAGREEMENT
+        ):
             return as_body25(points, None)
         return as_body25(points, find_feet(pose, points, apart))
 

@@ -1,4 +1,5 @@
-"""MoveNet MultiPose: up to six people and their 17 keypoints in a part of an image.
+"""Runs MoveNet MultiPose: up to six people and their 17 keypoints in a part of an
+image.
 
 The network's input may have any size whose sides are multiples of 32. It finds people
 who are about 40 to 250 px high in its input, so each part of the image is rescaled for
@@ -12,32 +13,33 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 NUM_KEYPOINTS = 17
-"""COCO's, in its order: nose, eyes, ears, shoulders, elbows, wrists, hips, knees,
-ankles, left before right."""
-_MULTIPLE = 32
-_SHIFT = -0.25
-"""px of the network's input, added to `relative place x size`: half a pixel is from
+"""Number of COCO keypoints, in COCO's order: nose, eyes, ears, shoulders, elbows,
+wrists, hips, knees, ankles, left before right."""
+_INPUT_MULTIPLE_PX = 32
+_KEYPOINT_SHIFT_PX = -0.25
+"""Shift in the network's input, added to `relative place x size`: half a pixel is from
 pixel edges to centres, and a quarter back is the network's own offset, from images and
 their mirror images (five clips, 545 keypoints; -0.27)."""
-_COINCIDENT = 0.05
-"""Two keypoints closer than this share of the person's size are the same one."""
-_SHARED = 3
-"""Least number of keypoints that two detections must share to be of one person."""
+_MAX_COINCIDENT_DISTANCE = 0.05
+"""Distance, relative to the person's size, up to which two keypoints coincide."""
+_MIN_SHARED_KEYPOINTS = 3
+"""Number of keypoints that two detections of one person must share."""
 
 Region = tuple[int, int, int, int]
-"""Left, top, right, bottom of a part of an image, px; the last two are outside it. It
-may reach beyond the image."""
+"""Left, top, right, bottom of a part of an image, px; the last two are exclusive. It
+may extend beyond the image."""
 
 
 def find_people(
     session: Any, image: UInt8[np.ndarray, "y x 3"], region: Region, longer: int
 ) -> tuple[Float[np.ndarray, "n 17 3"], Float[np.ndarray, " n"]]:
-    """Keypoints (u px, v px, score) and a score of each person in a part of an image.
+    """Returns the keypoints (u px, v px, score) and a score of each person in a part of
+    an image.
 
     Args:
         session: MoveNet.
         image: BGR.
-        longer: the longer side of the region in the network's input, px.
+        longer: longer side of the region in the network's input, px.
     """
     canvas, scale = letterbox(image, region, longer)
     rgb = canvas[..., ::-1].astype(np.int32)[None]
@@ -50,7 +52,7 @@ def find_people(
 def letterbox(
     image: UInt8[np.ndarray, "y x 3"], region: Region, longer: int
 ) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
-    """A part of an image at another scale, black beyond the image.
+    """Returns a part of an image at another scale, black beyond the image.
 
     **Returns:** the canvas, its sides the next multiples of 32, its content in the
     upper left corner; and its pixels per pixel of the image.
@@ -66,7 +68,9 @@ def letterbox(
     size = max(1, round(width * scale)), max(1, round(height * scale))
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     scaled = cv2.resize(patch, size, interpolation=how)
-    rows, columns = (-(-n // _MULTIPLE) * _MULTIPLE for n in scaled.shape[:2])
+    rows, columns = (
+        -(-n // _INPUT_MULTIPLE_PX) * _INPUT_MULTIPLE_PX for n in scaled.shape[:2]
+    )
     canvas = np.zeros((rows, columns, 3), np.uint8)
     canvas[: scaled.shape[0], : scaled.shape[1]] = scaled
     return canvas, scale
@@ -83,22 +87,26 @@ def decode(
     """
     yxs = raw[:, : 3 * NUM_KEYPOINTS].reshape(-1, NUM_KEYPOINTS, 3).astype(float)
     rows, columns = size
-    x, y = yxs[..., 1] * columns + _SHIFT, yxs[..., 0] * rows + _SHIFT
+    x, y = (
+        yxs[..., 1] * columns + _KEYPOINT_SHIFT_PX,
+        yxs[..., 0] * rows + _KEYPOINT_SHIFT_PX,
+    )
     return np.stack([x, y, yxs[..., 2]], axis=-1), raw[:, 55].astype(float)
 
 
 def to_image(
     xy: Float[np.ndarray, "*n 2"], region: Region, scale: float
 ) -> Float[np.ndarray, "*n 2"]:
-    """Pixels of the canvas of `letterbox` -> pixels of the image (centres at whole
-    numbers in both)."""
+    """Converts pixels of the canvas of `letterbox` to pixels of the image (pixel
+    centres have integer coordinates in both)."""
     return (xy + 0.5) / scale - 0.5 + np.array(region[:2])
 
 
 def distinct(
     points: Float[np.ndarray, "n 17 3"], score: Float[np.ndarray, " n"]
 ) -> Int[np.ndarray, " k"]:
-    """Indices of detections without duplicates of a person, highest score first.
+    """Returns the indices of detections without duplicates of a person, highest score
+    first.
 
     A detection is a duplicate if it is of the same person (`same_person`) as one with a
     higher score.
@@ -111,34 +119,34 @@ def distinct(
 
 
 def same_person(a: Float[np.ndarray, "17 3"], b: Float[np.ndarray, "17 3"]) -> bool:
-    """Whether two detections in one image are of one person.
+    """Returns whether two detections in one image are of one person.
 
     They are if they share at least three keypoints. The face counts as one of them, as
     its five keypoints are close together.
     """
     near = np.linalg.norm(a[:, :2] - b[:, :2], axis=1)
     size = max(box_size(a), box_size(b), 1.0)
-    shared = (near < _COINCIDENT * size) & sure_points(a) & sure_points(b)
-    return int(shared[5:].sum() + shared[:5].any()) >= _SHARED
+    shared = (near < _MAX_COINCIDENT_DISTANCE * size) & sure_points(a) & sure_points(b)
+    return int(shared[5:].sum() + shared[:5].any()) >= _MIN_SHARED_KEYPOINTS
 
 
 def sure_points(points: Float[np.ndarray, "17 3"]) -> Bool[np.ndarray, " 17"]:
-    """Keypoints whose score exceeds `SURE`."""
-    return points[:, 2] > SURE
+    """Returns the keypoints whose score exceeds `MIN_SURE_SCORE`."""
+    return points[:, 2] > MIN_SURE_SCORE
 
 
-SURE = 0.15
+MIN_SURE_SCORE = 0.15
 
 
 def box(points: Float[np.ndarray, "17 3"]) -> Float[np.ndarray, " 4"]:
-    """Left, top, right, bottom (px) of a person's keypoints with a score above `SURE`,
-    or of all keypoints if fewer than two have such a score."""
+    """Returns left, top, right, bottom (px) of a person's keypoints with a score above
+    `MIN_SURE_SCORE`, or of all keypoints if fewer than two have such a score."""
     sure = sure_points(points)
     chosen = points[sure if sure.sum() >= 2 else slice(None), :2]
     return np.concatenate([chosen.min(0), chosen.max(0)])
 
 
 def box_size(points: Float[np.ndarray, "17 3"]) -> float:
-    """Longer side of a person's `box`, px."""
+    """Returns the longer side of a person's `box`, px."""
     left, top, right, bottom = box(points)
     return float(max(right - left, bottom - top))

@@ -1,8 +1,8 @@
-"""The two networks that ship, as sessions of onnxruntime.
+"""Opens the two networks of the package as sessions of onnxruntime.
 
 MoveNet MultiPose finds people and their 17 COCO keypoints in an image; BlazePose GHUM
-adds heels, toes and a mask to one person at a time. `assets/networks/MODEL_CARD.md`
-says where they come from and under which licence.
+adds heels, toes and a mask for one person at a time. `assets/networks/MODEL_CARD.md`
+states their origin and licence.
 """
 
 import dataclasses
@@ -16,8 +16,8 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.files import read_bytes
 
 _FOLDER = Path(__file__).parent / "assets" / "networks"
-_MOST_THREADS = 4
-"""Convolutions of this size gain nothing from more."""
+_MAX_THREADS = 4
+"""Number of threads above which networks of this size do not become faster."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,10 +44,10 @@ NETWORKS = (MOVENET, BLAZEPOSE)
 
 
 def open_network(network: Network) -> Any:
-    """A session of one of the networks that ship, after its checksum was compared.
+    """Opens a session of one of the package's networks, after comparing its checksum.
 
-    It uses the processor cores that this process may use, four at most, and none of
-    them while it waits.
+    It uses the processor cores that this process may use, four at most, and none while
+    it waits.
 
     **Raises:** `InputError` if the file is missing or is not the one that was shipped,
     or onnxruntime is not installed.
@@ -58,7 +58,10 @@ def open_network(network: Network) -> Any:
 
 
 def check_network(network: Network) -> None:
-    """**Raises:** `InputError` if the file is missing or its checksum is another."""
+    """Compares the checksum of a network's file.
+
+    **Raises:** `InputError` if the file is missing or its checksum differs.
+    """
     advice = "install bodyslam-jax again, or give keypoints/"
     try:
         digest = hashlib.sha256(read_bytes(network.path)).hexdigest()
@@ -74,7 +77,7 @@ def check_network(network: Network) -> None:
 
 
 def network_status() -> list[tuple[str, str]]:
-    """Lines of (name, finding) for people, one for each network that ships."""
+    """Returns lines of (name, finding), one for each network of the package."""
     rows = []
     for network in NETWORKS:
         try:
@@ -87,15 +90,15 @@ def network_status() -> list[tuple[str, str]]:
 
 
 def make_session(path: Path) -> Any:
-    """An onnxruntime session of an ONNX file on the CPU.
+    """Opens an onnxruntime session of an ONNX file on the CPU.
 
     **Raises:** `InputError` if onnxruntime is missing or does not read the file.
     """
     onnxruntime = check_onnxruntime()
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = min(_available_cores(), _MOST_THREADS)
+    options.intra_op_num_threads = min(_available_cores(), _MAX_THREADS)
     options.inter_op_num_threads = 1
-    # Threads that wait in a busy loop would take the cores from everything else.
+    # Threads that wait in a busy loop would occupy the cores.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
     try:
@@ -109,7 +112,10 @@ def make_session(path: Path) -> Any:
 
 
 def check_onnxruntime() -> Any:
-    """The module. **Raises:** `InputError` if it is not installed."""
+    """Returns the module onnxruntime.
+
+    **Raises:** `InputError` if it is not installed.
+    """
     try:
         return importlib.import_module("onnxruntime")
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Conversion between bodies of files (SMPL's trans) and of the graph (pelvis pose)."""
+"""Converts between bodies of files (SMPL's trans) and of the graph (pelvis pose)."""
 
 import dataclasses
 
@@ -10,29 +10,32 @@ from bodyslam_jax.body import BodyModel, rest_joints
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Bodies
 
-DEPTH_JITTER = 0.005
-"""Standard deviation of the second difference of a pelvis' depth at 30 fps, m."""
-POSITION_JITTER = 0.015
-"""The same across the line of sight, m; includes a shaking camera."""
+DEPTH_JITTER_M = 0.005
+"""Standard deviation of the second difference of a pelvis' depth at 30 fps."""
+POSITION_JITTER_M = 0.015
+"""The same across the line of sight; includes a shaking camera."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PersonState:
-    """`h` people in `t` frames: pelvis pose in the camera, posture, one shape each."""
+    """Pelvis pose in the camera frame, posture, and one shape each, of `h` people in
+    `t` frames."""
 
     present: Bool[np.ndarray, "h t"]
     T_CH: Float[np.ndarray, "h t 4 4"]
-    """Translation is the pelvis joint in C, m; identity where absent."""
+    """Pelvis pose; the translation is the pelvis joint in C, m; identity where
+    absent."""
     body_pose: Float[np.ndarray, "h t 23 3"]
-    """θ, axis-angle, rad."""
+    """Body pose θ, axis-angle, rad."""
     shape: Float[np.ndarray, "h 10"]
-    """β, the median over the frames where present."""
+    """Shape β, the median over the frames where present."""
 
 
 def roots_from_bodies(bodies: Bodies, body: BodyModel) -> PersonState:
-    """To the graph's convention: `r_CH = J_0(β) + trans`, one β per person.
+    """Converts to the graph's convention: `r_CH = J_0(β) + trans`, with one β per
+    person.
 
-    The pelvis stays where the frame's own β put it: trans belongs to that β.
+    The pelvis position is computed with the frame's own β, which `trans` refers to.
     """
     present = np.asarray(bodies.present, bool)
     pelvis = _pelvis(body, bodies.shapes) + bodies.trans
@@ -50,7 +53,7 @@ def roots_from_bodies(bodies: Bodies, body: BodyModel) -> PersonState:
 
 
 def bodies_from_roots(roots: PersonState, body: BodyModel) -> Bodies:
-    """Inverse of `roots_from_bodies`, for bodies whose β does not change.
+    """Inverts `roots_from_bodies`, for bodies with constant β.
 
     The result is marked as estimated (`shapes_regressed=False`).
     """

@@ -1,13 +1,14 @@
-"""Which parts of people something in the image shows, whatever their bodies are from.
+"""Determines which parts of people are visible in the image, independently of the
+source of their bodies.
 
-A regressor returns a whole body of a person who is cut off at the waist: its legs are a
-guess, often a mean posture that stands still while the person walks. A keypoint is
-shown where the detector is at least half as confident of it as of this person's surest
-keypoints: of less certain ones the error is two to five times as large
+A regressor returns a complete body for a person who is cut off at the waist: its legs
+are a guess, often a mean posture that stands still while the person walks. A keypoint
+is shown where the detector is at least half as confident as for this person's most
+confident keypoints: the error of less confident ones is two to five times as large
 (`benchmarks/video.md`). In a frame in which the detector lost somebody who has a body
-there, it is shown if it was in the nearest frame with keypoints. Of people without any
-keypoints the body's points are shown that project into the image, and onto the masks
-of people if there are any: what hides a limb there is not known.
+there, a keypoint is shown if it was in the nearest frame with keypoints. For people
+without any keypoints, the points of the body are shown that project into the image, and
+onto the masks of people if there are any: occlusions are then unknown.
 """
 
 import dataclasses
@@ -29,30 +30,31 @@ from bodyslam_jax.people.keypoint_errors import keypoint_sigma
 from bodyslam_jax.sfm import person_masks
 from bodyslam_jax.types import Bodies, Sequence
 
-SURE = 0.5
-"""Least confidence of a keypoint that is shown, of that of the person's surest."""
+MIN_CONFIDENCE_RATIO = 0.5
+"""Least confidence of a shown keypoint, relative to that of the person's most confident
+ones."""
 KNEES_AND_ANKLES = tuple(
     BODY25[f"{side}_{name}"] for name in ("knee", "ankle") for side in ("left", "right")
 )
-MOSTLY = 0.55
+MIN_SHOWN_SHARE = 0.55
 """Share of knees and ankles that must be shown: with fewer, postures err by twice as
 much as those of people in full view (`benchmarks/video.md`)."""
-_STRIDE = 1.0
-"""s: time over which that share is taken. In a stride each leg hides the other once."""
+_STRIDE_S = 1.0
+"""Time over which that share is averaged. In a stride each leg hides the other once."""
 _MASK_MARGIN = 0.02
-"""Error of a projected joint, of a quarter of the image's height, by which masks are
-widened."""
+"""Error of a projected joint, relative to a quarter of the image's height, by which
+masks are widened."""
 
 
 def shown_keypoints(sequence: Sequence, body: BodyModel) -> Bool[np.ndarray, "h t 25"]:
-    """Keypoints of BODY_25 of all people that something in the image shows."""
+    """Returns which keypoints of BODY_25 of all people are visible in the image."""
     keypoints, bodies = sequence.keypoints, sequence.bodies
     there = np.zeros((people_in(sequence), sequence.num_frames), bool)
     shown = np.zeros((*there.shape, 25), bool)
     if keypoints is not None:
         for h in range(len(shown)):
             sigma = keypoint_sigma(keypoints, sequence.intrinsics, h)
-            shown[h] = sigma <= KEYPOINT_SIGMA / SURE
+            shown[h] = sigma <= KEYPOINT_SIGMA / MIN_CONFIDENCE_RATIO
         there = np.asarray((keypoints.confidence > 0).any(axis=-1))
     if bodies is None or not (bodies.present & ~there).any():
         return shown
@@ -71,29 +73,32 @@ def shown_keypoints(sequence: Sequence, body: BodyModel) -> Bool[np.ndarray, "h 
 def legs_shown(
     shown: Bool[np.ndarray, "h t 25"], present: Bool[np.ndarray, "h t"], fps: float
 ) -> Bool[np.ndarray, "h t"]:
-    """Frames in which a person's legs, and so the steps, are not only inferred.
+    """Returns the frames in which a person's legs, and so the steps, are not only
+    inferred.
 
-    Inferred are stretches of frames with fewer than `MOSTLY` of the knees and ankles
-    shown, if it is so in the second about one of the frames, too: legs that hide each
-    other for a moment are not. Frames in which the person is absent do not count.
+    Legs are inferred in stretches of frames with less than `MIN_SHOWN_SHARE` of the
+    knees and ankles shown, if the mean over the second around one of the frames is
+    below it, too: legs that hide each other momentarily are not inferred. Frames in
+    which the person is absent do not count.
     """
     share = shown[..., KNEES_AND_ANKLES].mean(axis=-1)
-    window = max(1, round(_STRIDE * fps))
+    window = max(1, round(_STRIDE_S * fps))
     mean = lambda x: uniform_filter1d(x, window, mode="constant")
     found = np.zeros(present.shape, bool)
     for h, frames in enumerate(present):
         for run in runs(frames):
             here = share[h, run]
-            lasting = mean(here) < (MOSTLY - 1e-9) * mean(np.ones(len(here)))
+            lasting = mean(here) < (MIN_SHOWN_SHARE - 1e-9) * mean(np.ones(len(here)))
             inferred = np.zeros(len(here), bool)
-            for stretch in runs(lasting | (here < MOSTLY)):
+            for stretch in runs(lasting | (here < MIN_SHOWN_SHARE)):
                 inferred[stretch] = lasting[stretch].any()
             found[h, run] = ~inferred
     return found
 
 
 def without_keypoints(sequence: Sequence) -> Bool[np.ndarray, " h"]:
-    """People who have a body and no keypoint: what hides their limbs is not known."""
+    """Returns the people who have a body but no keypoints, whose occlusions are
+    unknown."""
     if sequence.bodies is None:
         return np.zeros(people_in(sequence), bool)
     detected = np.zeros(people_in(sequence), bool)
@@ -103,14 +108,15 @@ def without_keypoints(sequence: Sequence) -> Bool[np.ndarray, " h"]:
 
 
 def people_in(sequence: Sequence) -> int:
-    """Number of people, by keypoints or by bodies."""
+    """Returns the number of people, by keypoints or by bodies."""
     if sequence.keypoints is not None:
         return len(sequence.keypoints.uv)
     return 0 if sequence.bodies is None else len(sequence.bodies.present)
 
 
 def joints_of(bodies: Bodies, body: BodyModel) -> Float[np.ndarray, "m 22 3"]:
-    """The first 22 joints in the camera frame, m, of all bodies that are present."""
+    """Returns the first 22 joints in the camera frame, m, of all bodies that are
+    present."""
     template = np.asarray(body.joint_template, float)[:22]
     directions = np.asarray(body.joint_shape_dirs, float)[:22]
     at = bodies.present
@@ -122,7 +128,8 @@ def joints_of(bodies: Bodies, body: BodyModel) -> Float[np.ndarray, "m 22 3"]:
 def _inside(
     sequence: Sequence, bodies: Bodies, body: BodyModel
 ) -> Bool[np.ndarray, "h t 25"]:
-    """Points of bodies that project into the image, and onto its masks of people."""
+    """Returns which points of bodies project into the image, and onto its masks of
+    people."""
     camera = sequence.intrinsics
     joints = joints_of(bodies, body)
     uv = project_rows(jnp.asarray(camera.params, float), joints.reshape(-1, 3))
@@ -140,7 +147,7 @@ def _inside(
 
 
 def _masks(sequence: Sequence) -> Iterator[np.ndarray]:
-    """The given masks of people, one of each frame, 0 elsewhere."""
+    """Yields the given masks of people, one per frame, 0 elsewhere."""
     alone = dataclasses.replace(sequence, keypoints=None, detected=None)
     for mask in person_masks(alone, _MASK_MARGIN):
         assert mask is not None
@@ -148,7 +155,8 @@ def _masks(sequence: Sequence) -> Iterator[np.ndarray]:
 
 
 def _nearest_joint(name: str) -> int:
-    """SMPL's joint that a keypoint of BODY_25 is, or is nearest to."""
+    """Returns SMPL's joint that coincides with a keypoint of BODY_25, or is nearest to
+    it."""
     side, _, part = name.partition("_")
     part = {"heel": "ankle", "big_toe": "foot", "small_toe": "foot"}.get(part, part)
     return KEYPOINT_JOINT.get(f"{side}_{part}", KEYPOINT_JOINT.get(name, HEAD))

@@ -1,10 +1,10 @@
 """Keypoints rigidly attached to bones, with derivatives in closed form.
 
 A surface keypoint (nose, ears, heels, toes) is attached to one bone as at rest, which
-is within millimetres of the skinned vertex. So derivatives are geometric: rotating
-joint j by a small vector ω about its own centre moves a point x below it by `ω x (x -
-x_j)`; no differentiation through a chain of rotations, which compiles and runs an order
-of magnitude slower.
+is within millimetres of the skinned vertex. Derivatives are therefore geometric:
+rotating joint j by a small vector ω about its own centre moves a point x below it by
+`ω x (x - x_j)`. Differentiation through a chain of rotations would compile and run an
+order of magnitude slower.
 """
 
 import equinox as eqx
@@ -29,7 +29,8 @@ _CARRIER = np.concatenate([PARENTS, _KEYPOINT_BONE])
 
 
 def _paths() -> np.ndarray:
-    """Which offsets (24 joints, then 25 keypoints) add up to each point's place."""
+    """Returns which offsets (24 joints, then 25 keypoints) add up to each point's
+    position."""
     path = np.zeros((49, 49))
     for point in range(49):
         link = point
@@ -39,7 +40,7 @@ def _paths() -> np.ndarray:
     return path
 
 
-_PATH = _paths()
+_PATH_MATRIX = _paths()
 
 
 # Offsets of a detector's keypoints from SMPL's, constant for a detector and person:
@@ -59,26 +60,28 @@ _OFFSETS = (
     *(((21, 24), axis, 0.015) for axis in (1, 2)),
 )
 NUM_SHAPE = 10 + len(_OFFSETS)
-"""β, then the detector's offsets in standard deviations."""
-_LEFT = (5, 6, 7, 12, 13, 14, 16, 18, 19, 20, 21)
+"""Number of shape components: β, then the detector's offsets in standard deviations."""
+_LEFT_KEYPOINTS = (5, 6, 7, 12, 13, 14, 16, 18, 19, 20, 21)
 
 
 class Skeleton(eqx.Module):
-    """Offsets of 24 joints and 25 keypoints from what carries them, at rest."""
+    """Offsets of 24 joints and 25 keypoints from the joints that carry them, at
+    rest."""
 
     offset: Float[Array, "49 3"]
-    """m, β = 0; the pelvis' own is 0."""
+    """Offsets for β = 0, m; that of the pelvis is 0."""
     offset_shape: Float[Array, "49 3 s"]
-    """Change per unit of each shape component, m: `NUM_SHAPE` of them."""
+    """Change of the offsets per unit of each of the `NUM_SHAPE` shape components, m."""
 
 
 class Points(eqx.Module):
-    """A posed skeleton in the root frame H, the pelvis at the origin."""
+    """A posed skeleton in the root frame H, m, with the pelvis at the origin."""
 
     joints: Float[Array, "24 3"]
     keypoints: Float[Array, "25 3"]
     by_angle: Float[Array, "25 21 3 3"]
-    """Of a coordinate (last axis) by a component of the angle of joints 1 to 21."""
+    """Derivative of a keypoint's coordinate (last axis) with respect to a component of
+    the angle of joints 1 to 21."""
     by_shape: Float[Array, "25 3 s"]
 
 
@@ -95,9 +98,11 @@ def _at_rest(body: BodyModel, bias: Array) -> Float[Array, "11 49 3"]:
 def make_skeleton(
     body: BodyModel, bias: float, definition: str = "unknown"
 ) -> Skeleton:
-    """`bias` as `body.local_keypoints` has it: 0 SMPL's joints, 1 COCO detectors'.
-    Keypoints are moved by the offsets of `definition` as well, if this is the default
-    body."""
+    """Returns the skeleton of a body model.
+
+    `bias` is that of `body.local_keypoints`: 0 for SMPL's joints, 1 for COCO detectors.
+    Keypoints are also moved by the offsets of `definition` if this is the default body.
+    """
     dtype = body.joint_template.dtype
     rest = np.asarray(_at_rest(body, jnp.asarray(bias, dtype)), float)
     offset = rest - np.where(_CARRIER[:, None] >= 0, rest[:, _CARRIER], 0.0)
@@ -109,7 +114,7 @@ def make_skeleton(
     by_shape[..., :10] = np.moveaxis(offset[1:] - offset[0], 0, -1)
     for column, (points, axis, sigma) in enumerate(_OFFSETS, start=10):
         for point in points:
-            mirrored = axis == 0 and point not in _LEFT
+            mirrored = axis == 0 and point not in _LEFT_KEYPOINTS
             by_shape[24 + point, axis, column] = -sigma if mirrored else sigma
     return Skeleton(jnp.asarray(offset[0], dtype), jnp.asarray(by_shape, dtype))
 
@@ -117,18 +122,18 @@ def make_skeleton(
 def place_points(
     skeleton: Skeleton, angles: Float[Array, " 63"], shape: Float[Array, " s"]
 ) -> tuple[Float[Array, "24 3"], Float[Array, "25 3"]]:
-    """Joints and keypoints in H, m, without derivatives."""
+    """Returns joints and keypoints in H, m, without derivatives."""
     orientation = _orientations(so3.exp(angles.reshape(21, 3)))
     offset = skeleton.offset + skeleton.offset_shape @ shape
     carried = jnp.einsum("pij,pj->pi", orientation[_carriers()], offset)
-    point = jnp.asarray(_PATH, angles.dtype) @ carried
+    point = jnp.asarray(_PATH_MATRIX, angles.dtype) @ carried
     return point[:24], point[24:]
 
 
 def pose_points(
     skeleton: Skeleton, angles: Float[Array, " 63"], shape: Float[Array, " s"]
 ) -> Points:
-    """The same with derivatives."""
+    """Returns joints and keypoints in H, m, with derivatives."""
     theta = angles.reshape(21, 3)
     turn = so3.exp(theta)
     change = jax.vmap(jax.jacfwd(so3.exp))(theta)
@@ -144,7 +149,7 @@ def pose_points(
         axis=-1,
     )
     carried = orientation[_carriers()] @ offsets
-    point = jnp.tensordot(jnp.asarray(_PATH, angles.dtype), carried, 1)
+    point = jnp.tensordot(jnp.asarray(_PATH_MATRIX, angles.dtype), carried, 1)
     place, by_shape = point[..., 0], point[24:, :, 1:]
     arm = place[24:, None] - place[None, 1:22]
     arm = arm * jnp.asarray(_below(), angles.dtype)[..., None]
@@ -157,12 +162,13 @@ def _carriers() -> Array:
 
 
 def _below() -> np.ndarray:
-    """Whether keypoint k hangs on joint j + 1, directly or further down."""
-    return _PATH[24:, 1:22]
+    """Returns whether keypoint k is attached to joint j + 1, directly or through
+    others."""
+    return _PATH_MATRIX[24:, 1:22]
 
 
 def _orientations(turn: Float[Array, "21 3 3"]) -> Float[Array, "24 3 3"]:
-    """Of every joint in H; hands do not turn."""
+    """Returns the orientation of every joint in H; hands are not rotated."""
     still = jnp.broadcast_to(jnp.eye(3, dtype=turn.dtype), (2, 3, 3))
     turn = jnp.concatenate([still[:1], turn, still])
     found = turn[:1]

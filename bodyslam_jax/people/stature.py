@@ -1,4 +1,4 @@
-"""A measured stature as information on a person's shape and distance."""
+"""Uses a measured stature as information on a person's shape and distance."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -12,16 +12,16 @@ from bodyslam_jax.config import Measured
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.people.person_state import PersonState
 
-_UP = 1
-REACH = 3.0
-"""Standard deviations of β within which a model has bodies of people: 99.7 % of those
-it was made from. Beyond, proportions are extrapolated: the default body's legs are 0.48
-of a stature of 1.70 m and 0.40 of one of 1.08 m."""
+_UP_AXIS = 1
+MAX_SHAPE_SIGMAS = 3.0
+"""Standard deviations of β within which a model represents people: 99.7 % of those it
+was made from. Beyond, proportions are extrapolated: the default body's legs are 0.48 of
+a stature of 1.70 m and 0.40 of one of 1.08 m."""
 SIZE_STEP = 0.01
 """Relative size of a body for one unit of a size axis. The prior on β (sigma 0.4) then
 holds the size of people of unknown stature to 0.4 %."""
-JOINT_SIGMA = 0.02
-"""m; error of joints at rest that counts as much as one standard deviation of β."""
+JOINT_SIGMA_M = 0.02
+"""Error of joints at rest that counts as much as one standard deviation of β."""
 
 
 class LinearStature(NamedTuple):
@@ -32,9 +32,10 @@ class LinearStature(NamedTuple):
 
 
 def linear_stature(body: BodyModel) -> LinearStature:
-    """From the highest vertex of the mean shape to the lowest."""
-    up = np.asarray(body.template, np.float64)[:, _UP]
-    by_shape = np.asarray(body.shape_dirs, np.float64)[:, _UP]
+    """Returns the height as a linear function of β, between the highest and the lowest
+    vertex of the mean shape."""
+    up = np.asarray(body.template, np.float64)[:, _UP_AXIS]
+    by_shape = np.asarray(body.shape_dirs, np.float64)[:, _UP_AXIS]
     top, bottom = int(np.argmax(up)), int(np.argmin(up))
     return LinearStature(float(up[top] - up[bottom]), by_shape[top] - by_shape[bottom])
 
@@ -42,8 +43,8 @@ def linear_stature(body: BodyModel) -> LinearStature:
 def statures_of(
     heights: Mapping[int | None, Measured], numbers: Sequence[int]
 ) -> dict[int, Measured]:
-    """Statures by index among the people with these `numbers`; that under the key
-    `None` applies to everybody without one of their own.
+    """Returns the statures by index among the people with these `numbers`; that under
+    the key `None` applies to everybody without one of their own.
 
     **Raises:** `InputError` if a stature is given for a number that nobody has.
     """
@@ -58,22 +59,22 @@ def statures_of(
 
 
 def stature_range(body: BodyModel) -> tuple[float, float]:
-    """Statures, m, of shapes of the body's file within `REACH` standard deviations of
-    the mean shape."""
+    """Returns the least and the greatest stature, m, of shapes within
+    `MAX_SHAPE_SIGMAS` standard deviations of the mean shape."""
     linear = linear_stature(body)
     slope = linear.slope[: 9 if body.sized else 10]
-    way = REACH * float(np.linalg.norm(slope))
+    way = MAX_SHAPE_SIGMAS * float(np.linalg.norm(slope))
     return linear.template - way, linear.template + way
 
 
 def beyond_reach(body: BodyModel, height: float) -> bool:
-    """Whether no shape of the model within its reach is `height` tall, m."""
+    """Returns whether no shape within that range is `height` tall, m."""
     low, high = stature_range(body)
     return not low <= height <= high
 
 
 def with_size_axis(body: BodyModel) -> BodyModel:
-    """The model with its last shape component replaced by its size.
+    """Returns the model with its last shape component replaced by its size.
 
     One unit of β₉ is `SIZE_STEP` of the mean shape's size, about the origin of the
     model, so that a body of any stature keeps the proportions of one within the
@@ -94,15 +95,16 @@ def with_statures(
     body: BodyModel,
     shape_sigma: Float[np.ndarray, " h"],
 ) -> PersonState:
-    """The most probable shapes given the statures, people as large in the image.
+    """Returns the most probable shapes given the statures, with distances changed so
+    that people keep their size in the image.
 
     β has the standard deviation `shape_sigma` about its estimate in every component, so
     that β moves along the slope g of the stature by `V (h̃ - h) / (V + σ²)` in m, with
-    the variance V = σ_β² |g|², or the difference squared where that is more: a fact
-    that contradicts the estimate shows that the estimate is off, not by how much.
-    Under a model with a size axis the body is resized instead where no shape within
-    the model's reach has the stature. Distances from the camera change in the ratio of
-    the statures.
+    the variance V = σ_β² |g|², or the squared difference if that is larger: a fact that
+    contradicts the estimate shows that the estimate is wrong, but not by how much. With
+    a model that has a size axis, the body is resized instead if no shape within the
+    model's range has the stature. Distances from the camera change in the ratio of the
+    statures.
     """
     linear = linear_stature(body)
     shape, T_CH = roots.shape.copy(), roots.T_CH.copy()
@@ -125,12 +127,12 @@ def with_statures(
 
 @dataclasses.dataclass(frozen=True)
 class WithoutStature:
-    """What a person's stature would be had it not been given."""
+    """Estimate of a person's stature without the given one."""
 
     value: float
-    """m"""
+    """Stature, m."""
     sigma: float
-    """m"""
+    """Standard deviation, m."""
 
 
 def stature_without(
@@ -142,18 +144,21 @@ def stature_without(
     before: Float[np.ndarray, " 10"],
     before_sigma: float,
 ) -> WithoutStature:
-    """The stature without the one that was given, from the estimate with it.
+    """Returns the stature without the given one, computed from the estimate with it.
 
-    The factor of the stature and the move of the shape prior to it are taken out of the
-    posterior of β in information form, which is exact for Gaussian factors and costs no
-    further solve. A size axis is held at 0 then: without a stature nobody is resized.
+    The factor of the stature and the resulting displacement of the shape prior are
+    removed from the posterior of β in information form, which is exact for Gaussian
+    factors and needs no further solve. A size axis is held at 0, because without a
+    stature nobody is resized.
 
     Args:
+        body: model of the estimate.
+        given: the given stature.
         shape: β at the optimum, with its marginal `covariance`.
         prior: mean and standard deviation of the prior on β in the estimate.
-        before: mean of the prior had no stature been given.
-        before_sigma: standard deviation of the stature of `before`, m; where it is more
-            than that of the prior, it is what is reported.
+        before: mean of the prior if no stature had been given.
+        before_sigma: standard deviation of the stature of `before`, m; if it exceeds
+            that of the prior, it is reported instead.
     """
     linear, (mean, sigma) = linear_stature(body), prior
     g = linear.slope
@@ -166,7 +171,7 @@ def stature_without(
     g = g[own]
     free = np.linalg.inv(information[own, own])
     variance = float(g @ free @ g)
-    # Of an error of `before` along g the estimate keeps the share of the prior in it.
+    # An error of `before` along g propagates with the prior's share in the estimate.
     more = max(before_sigma**2 - float(g @ g) / weight, 0.0)
     kept = variance * weight / float(g @ g)
     return WithoutStature(
@@ -178,20 +183,20 @@ def stature_without(
 def in_model(
     sized: BodyModel, body: BodyModel, shape: Float[np.ndarray, " 10"]
 ) -> Float[np.ndarray, " 10"]:
-    """The shape of `body` that is as tall as `shape` of the model with a size axis, and
-    nearest to its joints at rest.
+    """Returns the shape of `body` that is as tall as `shape` of the model with a size
+    axis, and nearest to its joints at rest.
 
-    Bones' ends are fitted in the least-squares sense, with the stature as a constraint
-    and a standard normal prior on β at an error of `JOINT_SIGMA`.
+    Ends of bones are fitted by least squares, with the stature as a constraint and a
+    standard normal prior on β at an error of `JOINT_SIGMA_M`.
     """
     wanted = np.asarray(sized.joint_template, float) + (
         np.asarray(sized.joint_shape_dirs, float) @ shape
     )
     template = np.asarray(body.joint_template, float)
     dirs = np.asarray(body.joint_shape_dirs, float)
-    # Relative to the pelvis, which `trans` places.
-    A = (dirs - dirs[:1]).reshape(-1, 10) / JOINT_SIGMA
-    b = ((wanted - wanted[:1]) - (template - template[:1])).ravel() / JOINT_SIGMA
+    # Relative to the pelvis, whose position is set by `trans`.
+    A = (dirs - dirs[:1]).reshape(-1, 10) / JOINT_SIGMA_M
+    b = ((wanted - wanted[:1]) - (template - template[:1])).ravel() / JOINT_SIGMA_M
     of_sized, of_body = linear_stature(sized), linear_stature(body)
     tall = of_sized.template + of_sized.slope @ shape - of_body.template
     system = np.zeros((11, 11))

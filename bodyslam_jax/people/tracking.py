@@ -1,7 +1,7 @@
-"""Online tracking of people over frames and short gaps.
+"""Tracks people online over frames and short gaps.
 
 Detections are assigned to tracklets by predicted position, size and colours of clothes.
-All three must agree; two tracklets of one person, which `linking` joins later, are
+All three must agree: two tracklets of one person, which `linking` joins later, are
 preferred to one tracklet of two people.
 """
 
@@ -15,26 +15,26 @@ from scipy.optimize import linear_sum_assignment
 from bodyslam_jax.people.appearance import difference, mean_look
 from bodyslam_jax.people.movenet import box_size, sure_points
 
-_REACH = 0.15
-"""Gate on the distance from the predicted position after one frame, of the person's
-height."""
-_REACH_PER_SECOND = 0.8
+_GATE_HEIGHTS = 0.15
+"""Gate on the distance from the predicted position after one frame, relative to the
+person's height in the image."""
+_GATE_GROWTH_HEIGHTS_PER_S = 0.8
 """Growth of the gate for each second without a detection."""
-_FADING = 0.5
-"""Time constant with which the predicted velocity decays, s."""
-_SMOOTHING = 0.1
-"""Time constant of the velocity's mean, s."""
-GROWTH = 1.6
+_VELOCITY_DECAY_S = 0.5
+"""Time constant with which the predicted velocity decays."""
+_VELOCITY_SMOOTHING_S = 0.1
+"""Time constant of the velocity's moving average."""
+MAX_SIZE_RATIO = 1.6
 """Ratio of sizes in the image above which a detection is of another person."""
-OTHER_CLOTHES = 30.0
+MAX_COLOUR_DIFFERENCE = 30.0
 """Difference of colours (`appearance.difference`) from which it is another person."""
-_RECENT = 45
-"""Frames over which the colours of a person are averaged."""
-AWHILE = 3
+_RECENT_FRAMES = 45
+"""Number of frames over which the colours of a person are averaged."""
+LONG_GAP_FRAMES = 3
 """Frames without a detection after which only an unoccluded one continues a track."""
-_FEWEST = 3
-"""Keypoints that two detections must have in common to be compared."""
-_TRUNK = 0.3
+_MIN_COMMON_KEYPOINTS = 3
+"""Number of common keypoints from which two detections are compared."""
+_TRUNK_HEIGHT_RATIO = 0.3
 """Length of the trunk as a share of the height."""
 
 
@@ -53,11 +53,11 @@ class Tracklet:
 
     @property
     def look(self) -> Float[np.ndarray, " d"]:
-        return mean_look(np.stack(self.looks[-_RECENT:]))
+        return mean_look(np.stack(self.looks[-_RECENT_FRAMES:]))
 
     def expected(self, frame: int, fps: float) -> Float[np.ndarray, "17 3"]:
-        """Predicted keypoints in a later frame, with decaying velocity."""
-        time = _FADING * fps
+        """Returns the predicted keypoints in a later frame, with decaying velocity."""
+        time = _VELOCITY_DECAY_S * fps
         steps = time * (1 - np.exp(-(frame - self.frames[-1]) / time))
         points = self.points[-1].copy()
         points[:, :2] += steps * self.velocity
@@ -71,7 +71,7 @@ class Tracklet:
         if both.any():
             gap = frame - self.frames[-1]
             moved = np.median((points - before)[both, :2], axis=0) / gap
-            share = 1 - np.exp(-gap / (_SMOOTHING * fps))
+            share = 1 - np.exp(-gap / (_VELOCITY_SMOOTHING_S * fps))
             if len(self.frames) == 1:
                 share = 1.0
             self.velocity = (1 - share) * self.velocity + share * moved
@@ -87,7 +87,7 @@ class Tracklet:
 
 
 def between(tracklet: Tracklet) -> list[tuple[int, Float[np.ndarray, "17 3"]]]:
-    """Linearly interpolated keypoints in the gaps of a tracklet."""
+    """Returns frame and linearly interpolated keypoints for the gaps of a tracklet."""
     found = []
     ends = zip(tracklet.frames, tracklet.points, strict=True)
     for (first, a), (last, b) in pairwise(ends):
@@ -98,7 +98,7 @@ def between(tracklet: Tracklet) -> list[tuple[int, Float[np.ndarray, "17 3"]]]:
 
 
 class Tracker:
-    """Tracklets that grow with each frame's detections."""
+    """Extends tracklets by each frame's detections."""
 
     def __init__(self, fps: float, max_gap: float) -> None:
         self.fps = fps
@@ -106,7 +106,7 @@ class Tracker:
         self.tracklets: list[Tracklet] = []
 
     def alive(self, frame: int) -> list[Tracklet]:
-        """Tracklets that a detection in `frame` may continue."""
+        """Returns the tracklets that a detection in `frame` may continue."""
         return [t for t in self.tracklets if frame - t.frames[-1] <= self.max_gap]
 
     def update(
@@ -117,12 +117,12 @@ class Tracker:
         may_return: Bool[np.ndarray, " n"],
         may_start: Bool[np.ndarray, " n"],
     ) -> Int[np.ndarray, " n"]:
-        """The number of the tracklet that each detection continues or begins.
+        """Returns the number of the tracklet that each detection continues or begins.
 
         Args:
             may_return: which detections may continue a track after a longer gap.
-            may_start: which detections are sure enough to begin a track; the others
-                get -1 if they continue none.
+            may_start: which detections are confident enough to begin a track; the
+                others get -1 if they continue none.
         """
         who = np.full(len(points), -1)
         alive = self.alive(frame)
@@ -134,7 +134,7 @@ class Tracker:
                 ]
             )
             away = np.array([frame - t.frames[-1] for t in alive])
-            cost[(away > AWHILE)[:, None] & ~may_return] = 1e3
+            cost[(away > LONG_GAP_FRAMES)[:, None] & ~may_return] = 1e3
             rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
             for i, j in zip(rows, columns, strict=True):
                 if cost[i, j] < 1:
@@ -150,9 +150,10 @@ class Tracker:
     def cost(
         self, tracklet: Tracklet, frame: int, points: np.ndarray, look: np.ndarray
     ) -> float:
-        """Cost of assignment: 0 for a perfect match, 1 and more outside the gates."""
+        """Returns the cost of assignment: 0 for a perfect match, 1 and more outside the
+        gates."""
         away = frame - tracklet.frames[-1]
-        reach = _REACH + _REACH_PER_SECOND * (away - 1) / self.fps
+        reach = _GATE_HEIGHTS + _GATE_GROWTH_HEIGHTS_PER_S * (away - 1) / self.fps
         return _unlike(
             displacement(tracklet.expected(frame, self.fps), points) / reach,
             height(points) / height(tracklet.points[-1]),
@@ -162,46 +163,51 @@ class Tracker:
     def cost_before(
         self, tracklet: Tracklet, points: np.ndarray, look: np.ndarray
     ) -> float:
-        """As `cost`, for a detection in the frame before the tracklet's first."""
+        """Returns the cost, as `cost`, for a detection in the frame before the
+        tracklet's first."""
         first = tracklet.points[0]
         return _unlike(
-            displacement(first, points) / _REACH,
+            displacement(first, points) / _GATE_HEIGHTS,
             height(points) / height(first),
             difference(tracklet.look, look),
         )
 
 
 def _unlike(place: float, growth: float, clothes: float) -> float:
-    """Weighted cost of assignment; 1000 if any of the three is outside its gate, else
-    below 1.
+    """Returns the weighted cost of assignment; 1000 if any of the three is outside its
+    gate, else below 1.
 
     Args:
-        place: distance in the image over its gate.
-        growth: ratio of the person's sizes in the image, gate `GROWTH`.
-        clothes: difference of the clothes' colours, gate `OTHER_CLOTHES`; NaN if it is
-            not known.
+        place: distance in the image, relative to its gate.
+        growth: ratio of the person's sizes in the image, gate `MAX_SIZE_RATIO`.
+        clothes: difference of the clothes' colours, gate `MAX_COLOUR_DIFFERENCE`; NaN
+            if unknown.
     """
-    growth = abs(float(np.log(growth))) / np.log(GROWTH)
-    clothes = 0.3 if np.isnan(clothes) else clothes / OTHER_CLOTHES
+    growth = abs(float(np.log(growth))) / np.log(MAX_SIZE_RATIO)
+    clothes = 0.3 if np.isnan(clothes) else clothes / MAX_COLOUR_DIFFERENCE
     if max(place, growth, clothes) >= 1:
         return 1e3
     return 0.6 * place + 0.1 * growth + 0.3 * clothes
 
 
 def displacement(a: Float[np.ndarray, "17 3"], b: Float[np.ndarray, "17 3"]) -> float:
-    """Median distance of two sets of keypoints, of the person's height: robust against
-    a lost or exchanged limb. Infinite where too few are sure in both."""
+    """Returns the median distance of two sets of keypoints, relative to the person's
+    height.
+
+    It is robust to a lost or exchanged limb, and infinite if too few keypoints are
+    confident in both.
+    """
     both = sure_points(a) & sure_points(b)
-    if both.sum() < _FEWEST:
+    if both.sum() < _MIN_COMMON_KEYPOINTS:
         return np.inf
     apart = np.median(np.linalg.norm((a - b)[both, :2], axis=1))
     return float(apart) / max(height(a), height(b))
 
 
 def height(points: Float[np.ndarray, "17 3"]) -> float:
-    """Size of a person in the image (px), also if bent or partly hidden."""
+    """Returns the size of a person in the image (px), also if bent or partly hidden."""
     size = max(box_size(points), 1.0)
     if sure_points(points)[[5, 6, 11, 12]].all():
         trunk = points[[5, 6], :2].mean(0) - points[[11, 12], :2].mean(0)
-        size = max(size, float(np.linalg.norm(trunk)) / _TRUNK)
+        size = max(size, float(np.linalg.norm(trunk)) / _TRUNK_HEIGHT_RATIO)
     return size

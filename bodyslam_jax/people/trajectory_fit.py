@@ -1,10 +1,11 @@
-"""All frames of one person at once: Gauss--Newton on a chain.
+"""Fits all frames of one person at once, by Gauss--Newton on a chain.
 
 Neighbouring frames are tied by second-order terms: the posture's autoregression and a
 constant velocity of root position and orientation. Each ties one coordinate of frames
-k, k-1, k-2, so off the diagonal the normal matrix is diagonal; frames are taken in
-pairs, which makes it block-tridiagonal, and it is factored by a scan. The shape β is a
-border of 10 columns. Levenberg's damping, steps that do not help are taken back.
+k, k-1, k-2, so that the off-diagonal blocks of the normal matrix are diagonal. Frames
+are combined in pairs, which makes the matrix block-tridiagonal, and it is factorised by
+a scan. The shape β forms a border. Damping is Levenberg's; steps that do not decrease
+the cost are rejected.
 """
 
 import equinox as eqx
@@ -20,13 +21,14 @@ class Ties(eqx.Module):
     """Temporal terms `w (y_k + c1 y_{k-1} + c2 y_{k-2})²`, per frame and coordinate."""
 
     weight: Float[Array, "t n"]
-    """0 where frame k is not tied to those before it."""
+    """Weight of the term; 0 where frame k is not tied to earlier ones."""
     c1: Float[Array, "t n"]
     c2: Float[Array, "t n"]
 
 
 class ChainProblem(eqx.Module):
-    """One person, `t` frames (an even number); padding has `sigma = inf`, no ties."""
+    """Measurements and priors of one person in `t` frames (an even number); padding has
+    `sigma = inf` and no ties."""
 
     scene: Scene
     uv: Float[Array, "t 25 2"]
@@ -38,6 +40,8 @@ class ChainProblem(eqx.Module):
 
 
 class Chain(eqx.Module):
+    """Pose of one person in each frame, and the shape."""
+
     fit: Fit
     shape: Float[Array, " s"]
 
@@ -46,7 +50,8 @@ class Chain(eqx.Module):
 def solve_chain(
     problem: ChainProblem, start: Chain, max_steps: int
 ) -> tuple[Chain, Float[Array, ""]]:
-    """The most probable bodies from `start` downhill, and their cost."""
+    """Returns the bodies at a local minimum of the cost, descending from `start`, and
+    the cost."""
 
     def step(carry: tuple) -> tuple:
         chain, normal, value, damping, count, _ = carry
@@ -62,8 +67,8 @@ def solve_chain(
         done = (better & small) | (damping > 1e6)
         return chain, normal, jnp.minimum(new_value, value), damping, count + 1, done
 
-    # The first round goes nowhere, is accepted, and leaves the equations of the start:
-    # so the derivatives stand in the loop's body alone, and are compiled once.
+    # The first iteration makes a zero step and evaluates the start, so that the
+    # derivatives occur in the loop's body alone and are compiled once.
     like = jax.eval_shape(lambda: _evaluate(problem, start)[0])
     blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), like)
     infinite = jnp.asarray(jnp.inf, start.shape.dtype)
@@ -77,7 +82,8 @@ def solve_chain(
 
 
 def _evaluate(problem: ChainProblem, chain: Chain) -> tuple[Normal, Float[Array, ""]]:
-    """Each frame's normal equations, and the negative log-posterior of all."""
+    """Returns each frame's normal equations, and the negative log posterior of all
+    frames."""
     normal: Normal = jax.vmap(linearise, in_axes=(None, 0, None, 0, 0, 0))(
         problem.scene,
         chain.fit,
@@ -100,8 +106,11 @@ def _move(chain: Chain, step: Array, shape_step: Array) -> Chain:
 
 
 def _temporal(ties: Ties, fit: Fit) -> Float[Array, "t n"]:
-    """`y_k + c1 y_{k-1} + c2 y_{k-2}`; for orientations with c1 = -2, c2 = 1 the change
-    of the turn from one frame to the next, with c1 = -1, c2 = 0 the turn itself."""
+    """Returns the residuals `y_k + c1 y_{k-1} + c2 y_{k-2}`.
+
+    For orientations they are the change of the rotation between successive frames with
+    c1 = -2, c2 = 1, and that rotation itself with c1 = -1, c2 = 0.
+    """
     linear = jnp.concatenate([fit.position, fit.latent], axis=-1)
     before, earlier = _shifted(linear, 1), _shifted(linear, 2)
     linear = linear + ties.c1[:, 3:] * before + ties.c2[:, 3:] * earlier
@@ -111,13 +120,16 @@ def _temporal(ties: Ties, fit: Fit) -> Float[Array, "t n"]:
 
 
 def _shifted(values: Array, by: int) -> Array:
-    """Row k is row k - by; the first rows repeat, where no tie reaches."""
+    """Returns rows shifted so that row k is row k - by; the first row is repeated where
+    no tie reaches."""
     return jnp.concatenate([values[:1]] * by + [values[:-by]])
 
 
 def _newton(
     problem: ChainProblem, chain: Chain, normal: Normal, damping: Array
 ) -> tuple[Float[Array, "t n"], Float[Array, " s"]]:
+    """Returns the Gauss--Newton step of the frames and of the shape, with β as
+    border."""
     ties = problem.ties
     w, c1, c2 = ties.weight, ties.c1, ties.c2
     pull = w * _temporal(ties, chain.fit)
@@ -153,7 +165,7 @@ def _newton(
 
 
 def _ahead(values: Array, by: int) -> Array:
-    """Row k is row k + by, zero beyond the end."""
+    """Returns rows shifted so that row k is row k + by, zero beyond the end."""
     return jnp.concatenate([values[by:], jnp.zeros_like(values[:by])])
 
 
@@ -173,7 +185,7 @@ def _solve_banded(
     right = right.reshape(pairs, 2 * size, columns)
     identity = jnp.eye(2 * size, dtype=right.dtype)
     # The block before the diagonal, frames 2i, 2i+1 by frames 2i-2, 2i-1, is made of
-    # diagonals, [[p, q], [0, r]]; so a product with it is no matrix product.
+    # diagonals, [[p, q], [0, r]], so that products with it are elementwise.
     back = jnp.stack([two_back[even], one_back[even], two_back[odd]], axis=1)
     back = back.at[0].set(0.0)
 
