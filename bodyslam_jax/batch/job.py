@@ -35,6 +35,7 @@ class Job:
 
     @property
     def name(self) -> str:
+        """Name of the clip."""
         return self.source.name
 
     @property
@@ -65,6 +66,7 @@ class Outcome:
 
     @property
     def is_failure(self) -> bool:
+        """Whether there is no usable result."""
         return self.status in ("failed", "error")
 
     def result(self) -> Any:

@@ -101,6 +101,7 @@ class _Worker:
         self.busy = False
 
     def start(self, item: Any, attempts: int) -> None:
+        """Sends an item to the process, which is started if it is the first."""
         self.item, self.attempts, self.busy = item, attempts, True
         if self._theirs is not None:
             self.process.start()
@@ -132,6 +133,7 @@ class _Worker:
             self.process.terminate()
 
     def join(self) -> None:
+        """Waits until the process has ended, and kills it after a timeout."""
         if self.process.pid is not None:
             self.process.join(_SHUTDOWN_TIMEOUT_S)
             if self.process.is_alive():

@@ -72,6 +72,7 @@ class ProgramCache:
         """Keys whose lock this process has, and the thread that compiles them."""
 
     def get(self, key: str) -> bytes | None:
+        """Returns the program of a key; `None` if this process has to compile it."""
         self.release()
         found = self._read(key)
         if found is None:
@@ -83,6 +84,7 @@ class ProgramCache:
 
     def put(self, key: str, value: bytes) -> None:
         # Existing entries are replaced: JAX compiles programs that it cannot read.
+        """Stores the program of a key, and releases its lock."""
         try:
             atomic.write_bytes(self._file(key), value)
         finally:

@@ -118,6 +118,7 @@ class _Actor:
             self.is_prepared = True
 
     def call(self, item: Any) -> Any:
+        """Returns the function's value for an item, or a `Failure`."""
         self.prepare()
         return attempt(self.function, item)
 

@@ -43,6 +43,7 @@ class SweepJob:
 
     @property
     def label(self) -> str:
+        """Name of the clip, followed by the values of its settings."""
         parts = [f"{name}={value}" for name, value in self.setting.items()]
         return " ".join([self.source.name, *parts])
 

@@ -33,6 +33,7 @@ class Column:
         return found if found != "" else None
 
     def text(self, row: Row) -> str:
+        """Returns the row's value as the text of a cell."""
         found = self.value(row)
         if found is None:
             return "–"

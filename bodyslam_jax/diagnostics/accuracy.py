@@ -51,14 +51,14 @@ class Accuracy:
 
     @property
     def across(self) -> float:
-        """Relative standard deviation of lengths across the view, of the most accurate
-        person."""
+        """Relative standard deviation of lengths across the view, for the person whose
+        size is known best."""
         return min((p.across for p in self.people if p.across > 0), default=np.nan)
 
     @property
     def along(self) -> float:
-        """Relative standard deviation of distances from the camera, of the most
-        accurate person."""
+        """Relative standard deviation of distances from the camera, for the person
+        whose size is known best."""
         return min((p.along for p in self.people if p.along > 0), default=np.nan)
 
 

@@ -25,7 +25,7 @@ class Check:
     advice: str
     """Advice to the user if the check fails."""
     source: str
-    """Where the threshold comes from."""
+    """Source of the threshold."""
     below: bool = False
     """Whether the limit is a lower bound."""
 

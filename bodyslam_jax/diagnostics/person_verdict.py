@@ -33,9 +33,9 @@ class PersonVerdict:
     """Frames in which the person is present."""
     path: PathStatistics
     steps_per_s: float | None
-    """`None` where no regular steps are found."""
+    """Cadence; `None` where no regular steps are found."""
     stature: float | None
-    """m; `None` for a person who is in no frame."""
+    """Stature, m; `None` for a person who is in no frame."""
     stature_sigma: float | None
     """Standard deviation, m; NaN if uncertainty was not computed."""
     status: PersonStatus

@@ -30,7 +30,7 @@ class Similarity(eqx.Module):
     """Scale of the truth relative to the estimate; 1 in SE(3)."""
     rotation: Float[Array, "*b 3 3"]
     translation: Float[Array, "*b 3"]
-    """m"""
+    """Translation, m."""
 
     def apply(self, points: Float[Array, "*p 3"]) -> Float[Array, "*p 3"]:
         """Transforms points by a single similarity (`*b` empty)."""

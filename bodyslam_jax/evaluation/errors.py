@@ -100,9 +100,11 @@ class Evaluation(eqx.Module):
         return len(self.values)
 
     def keys(self):
+        """Returns the names of the errors."""
         return self.values.keys()
 
     def items(self):
+        """Returns pairs of name and error."""
         return self.values.items()
 
 

@@ -27,6 +27,7 @@ class Journal:
         """Number of rows that were not on disk."""
 
     def path(self, name: str, label: str, *key: Any) -> Path:
+        """Returns the file of the row with this label and key."""
         words = re.sub(r"[^A-Za-z0-9.]+", "_", label).strip("_")
         return self.folder / f"{name}-{words}-{fingerprint(name, label, *key)}.json"
 

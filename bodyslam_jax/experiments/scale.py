@@ -34,7 +34,7 @@ class ScaleRecovery:
     scale: Float[np.ndarray, " p"]
     """Estimated s, relative to the unit of the perturbed map."""
     history: Float[np.ndarray, "p n"]
-    """s after each iteration, the start included."""
+    """Scale s after each iteration, including the start."""
     h_ate: Float[np.ndarray, "p n"]
     """H-ATE under SE(3) after each iteration, m."""
 

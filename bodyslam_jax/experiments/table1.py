@@ -152,7 +152,7 @@ def _ours_and_theirs(key: str) -> tuple[tuple[str, str], tuple[str, str]]:
 
 
 def _errors(method: str, label: str = "") -> Sequence[Column]:
-    """C-, H- and J-ATE of one method, mm."""
+    """Returns the columns of C-, H- and J-ATE of one method, mm."""
     return [
         Column(f"{e.upper()}-ATE {name}{label}, mm", f"{method}/{e}_ate_{group}", MM)
         for group, name in _GROUPS.items()

@@ -28,12 +28,14 @@ class Column:
     """Whether the last row of the table holds the mean."""
 
     def value(self, row: dict[str, Any]) -> Cell:
+        """Returns the row's value in the unit of the table."""
         found = row.get(self.key)
         if isinstance(found, (int, float)) and not isinstance(found, bool):
             return found * self.factor
         return found
 
     def text(self, value: Cell) -> str:
+        """Returns a value as the text of a cell."""
         if value is None:
             return "–"
         return value if isinstance(value, str) else f"{value:.{self.digits}f}"

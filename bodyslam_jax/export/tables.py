@@ -52,6 +52,8 @@ def _error(value: Any, factor: float) -> str:
 
 
 def number(value: Any, factor: float = 1.0) -> str:
+    """Returns a number times `factor` as text with four digits; a dash if it is not
+    finite."""
     if not isinstance(value, (int, float)) or not math.isfinite(value):
         return "–"
     value *= factor
@@ -61,6 +63,7 @@ def number(value: Any, factor: float = 1.0) -> str:
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """Returns a table as HTML; the first cell of each row is its header."""
     head = "".join(_header(words(str(column))) for column in columns)
     body = "".join(
         f'<tr><th scope="row">{html.escape(words(str(name)))}</th>'
@@ -84,8 +87,10 @@ def _cell(value: Any) -> str:
 
 
 def words(name: str) -> str:
+    """Returns a name with spaces for underscores."""
     return name.replace("_", " ")
 
 
 def folded(title: str, content: str) -> str:
+    """Returns content that is folded below its title, as HTML."""
     return f"<details><summary>{title}</summary>{content}</details>"

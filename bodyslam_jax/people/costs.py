@@ -45,6 +45,8 @@ class Fit(eqx.Module):
     """Posture, in standard deviations of the prior's components."""
 
     def moved(self, step: Float[Array, "*b n"]) -> "Fit":
+        """Returns the pose after a step: a rotation (left, rad), a translation (m), and
+        a change of the latent posture. The depth is kept above `MIN_DEPTH_M`."""
         turn = so3.exp(step[..., :3])
         position = self.position + step[..., 3:6]
         depth = jnp.maximum(position[..., 2:], MIN_DEPTH_M)

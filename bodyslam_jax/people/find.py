@@ -115,11 +115,12 @@ class _Finder:
         )
         self.recent: deque[tuple[int, _Frame]] = deque(maxlen=self.interval + 1)
         self.feet: dict[tuple[int, int], np.ndarray] = {}
-        """By tracklet and frame: heel and big toe of both sides (4, 3)."""
+        """Heel and big toe of both sides (4, 3), by tracklet and frame."""
         self.others: list[tuple[int, np.ndarray]] = []
         self.masks: list[np.ndarray] = []
 
     def advance(self, k: int, image: np.ndarray) -> None:
+        """Processes image `k` (BGR): detects people and assigns them to tracklets."""
         size = tuple(-(-n // SILHOUETTE_STEP) for n in image.shape[:2])
         now = _Frame(image, np.zeros(size, bool), {}, [])
         expected = [t.expected(k, self.fps) for t in self.tracker.alive(k)]
@@ -152,6 +153,8 @@ class _Finder:
         self.recent.append((k, now))
 
     def result(self) -> Found:
+        """Returns all detections after the last image, with tracklets linked to
+        people."""
         everybody = link(self.tracker.tracklets, self.fps)
         phantoms = [p for p in everybody if self._is_phantom(p)]
         real = [p for p in everybody if not any(p is q for q in phantoms)]

@@ -29,6 +29,7 @@ class Network:
 
     @property
     def path(self) -> Path:
+        """Path of the file."""
         return _FOLDER / self.name
 
 

@@ -53,6 +53,7 @@ class Tracklet:
 
     @property
     def look(self) -> Float[np.ndarray, " d"]:
+        """Mean descriptor of the clothes over the last frames."""
         return mean_look(np.stack(self.looks[-_RECENT_FRAMES:]))
 
     def expected(self, frame: int, fps: float) -> Float[np.ndarray, "17 3"]:
@@ -66,6 +67,7 @@ class Tracklet:
     def extend(
         self, frame: int, points: np.ndarray, look: np.ndarray, fps: float
     ) -> None:
+        """Appends a detection in a later frame, and updates the velocity."""
         before = self.points[-1]
         both = sure_points(points) & sure_points(before)
         if both.any():

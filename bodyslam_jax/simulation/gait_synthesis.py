@@ -204,8 +204,8 @@ class _Library:
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
-    """For each frame, the two library frames that are blended, with their weights and
-    yaws."""
+    """Plan of a walk: for each frame the two library frames that are blended, with
+    weights and yaws."""
 
     frame: Int[np.ndarray, "t 2"]
     share: Float[np.ndarray, "t 2"]

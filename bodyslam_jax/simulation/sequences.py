@@ -127,6 +127,7 @@ class SimulatedSequence:
 
     @property
     def num_frames(self) -> int:
+        """Number of frames."""
         return len(self.timestamps)
 
     @property

@@ -27,6 +27,8 @@ class Terrain(Room):
     height: Height
 
     def faces(self) -> tuple[Surface, ...]:
+        """Returns all rectangles that can be seen: tiles of the floor, furniture raised
+        to it, and the walls above it."""
         raised = [
             dataclasses.replace(
                 box, centre=box.centre + self.height(box.centre[[0, 2]]) * _UP

@@ -53,7 +53,8 @@ class ImageMap:
         return moved[..., MIRRORED_POINTS, :] if self.swap else moved
 
     def inverse(self, uv: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """`A^-1 (q - b)`: pixels of the image of the keypoints -> pixels of the video.
+        """Applies `A^-1 (q - b)`, from pixels of the keypoints' image to pixels of the
+        video.
 
         Left and right are not exchanged back, even if `swap` is set.
         """
@@ -307,7 +308,7 @@ def some_frames(people: People, most: int) -> np.ndarray:
 
 
 def evenly(where: np.ndarray, most: int) -> np.ndarray:
-    """Up to `most` evenly spaced entries of `where`."""
+    """Returns up to `most` evenly spaced entries of `where`."""
     if len(where) <= most:
         return where
     return where[np.linspace(0, len(where) - 1, most).round().astype(int)]

@@ -40,9 +40,9 @@ class People:
     """People in each of `t` frames, from keypoints and from bodies."""
 
     keypoints: Float[np.ndarray, "t k 14 2"]
-    """px"""
+    """Detected points, px."""
     bodies: Float[np.ndarray, "t b 14 3"]
-    """m, in the camera frame"""
+    """Points of the bodies in the camera frame, m."""
     camera: Intrinsics
 
     @property

@@ -63,9 +63,12 @@ class _Document:
         self.channels: list[dict[str, Any]] = []
 
     def positions(self, points: Float[np.ndarray, "n 3"]) -> int:
+        """Appends points (m) as vertex positions, and returns the index of their
+        accessor."""
         return self.buffer.add(points.astype(np.float32), VERTICES, bounds=True)
 
     def add_node(self, node: dict[str, Any], root: bool = False) -> int:
+        """Appends a node, and returns its index."""
         self.nodes.append(node)
         if root:
             self.roots.append(len(self.nodes) - 1)
@@ -113,6 +116,7 @@ class _Document:
     def animate(
         self, node: int, what: str, times: int, values: np.ndarray, steps: bool = False
     ) -> None:
+        """Animates a property of a node: `translation`, `rotation` or `scale`."""
         self.samplers.append(
             {
                 "input": times,
@@ -124,6 +128,7 @@ class _Document:
         self.channels.append({"sampler": len(self.samplers) - 1, "target": target})
 
     def write(self, path: Path, name: str) -> None:
+        """Writes the document as `.glb`."""
         animation = {
             "name": name,
             "samplers": self.samplers,

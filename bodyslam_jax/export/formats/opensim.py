@@ -1,4 +1,4 @@
-"""OpenSim: a model of one person, markers, and the set-up of inverse kinematics.
+"""Writes an OpenSim model of one person, markers, and the set-up of inverse kinematics.
 
     opensim-cmd run-tool inverse_kinematics.xml
 
@@ -6,14 +6,14 @@ in the folder writes `angles.mot`. The model has this person's segment lengths: 
 centres of the body model at rest. Its axes and angles are OpenSim's, which follow the
 International Society of Biomechanics (Wu et al., J. Biomech. 35, 2002, and 38, 2005): x
 forward, y up, z to the right; coordinates have the names and signs of Rajagopal et al.
-(IEEE Trans. Biomed. Eng. 63, 2016) where that model has them. The pelvis turns about
-the vertical first, so that tilt and list are about the person's own axes (Baker, Human
-Movement Science 20, 2001). Knees are hinges, the trunk is one segment.
+(IEEE Trans. Biomed. Eng. 63, 2016) where that model has them. The first rotation of the
+pelvis is about the vertical, so that tilt and list are about the person's own axes
+(Baker, Human Movement Science 20, 2001). Knees are hinges, the trunk is one segment.
 
 A segment has two markers beside its joint centres, 0.1 m in front of its joint and to
-its right. They carry the orientation about the segment's axis, which joint centres do
-not tell. Masses are not measured: each segment has 1 kg, by which inverse kinematics is
-not affected and inverse dynamics would be.
+its right. They determine the orientation about the segment's axis, which joint centres
+do not. Masses are not measured: each segment has 1 kg, which does not affect inverse
+kinematics, but would affect inverse dynamics.
 """
 
 import dataclasses
@@ -30,19 +30,19 @@ from bodyslam_jax.export.formats.scene import Scene, at_constant_rate
 from bodyslam_jax.export.formats.trc import trc_text
 from bodyslam_jax.geometry import so3_numpy as so3
 
-_CLUSTER_M = 0.1
-"""Distance of a segment's two further markers from its joint."""
+_CLUSTER_DISTANCE_M = 0.1
+"""Distance of a segment's two additional markers from its joint."""
 _CENTRE_WEIGHT, _CLUSTER_WEIGHT, _TRUNK_WEIGHT = 10.0, 1.0, 1.0
-"""Of markers in inverse kinematics. Limbs follow their joint centres; the trunk bends,
-which a single segment cannot."""
+"""Weights of markers in inverse kinematics. Limbs follow their joint centres; those of
+the trunk have less weight, because it bends and a single segment cannot."""
 _X, _Y, _Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
 _MINUS_X, _MINUS_Y, _MINUS_Z = (-1, 0, 0), (0, -1, 0), (0, 0, -1)
-_HANGING = {
+_ARM_ROTATIONS = {
     "r": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
     "l": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
 }
-"""Rotations from a segment of the arm whose zero is hanging down to SMPL's, whose arms
-point to the sides at rest."""
+"""Rotations from a segment of the arm, whose zero position hangs down, to SMPL's, whose
+arms point to the sides at rest."""
 
 Axis = tuple[int, int, int]
 Rotation = Float[np.ndarray, "3 3"]
@@ -50,20 +50,22 @@ Rotation = Float[np.ndarray, "3 3"]
 
 @dataclasses.dataclass(frozen=True)
 class Segment:
-    """A rigid body of the model and the joint by which it hangs on its parent."""
+    """A rigid body of the model, with the joint that connects it to its parent."""
 
     name: str
     parent: str
     joint: int
-    """SMPL's joint at its origin."""
+    """SMPL's joint at the segment's origin."""
     turns_with: int
-    """SMPL's joint whose orientation it has."""
+    """SMPL's joint that has the segment's orientation."""
     coordinates: tuple[tuple[str, Axis], ...]
-    """Of its joint: names and axes in the parent's frame, in the order of rotations."""
+    """Coordinates of its joint: names, and axes in the parent's frame, in the order of
+    rotations."""
     centres: tuple[int, ...]
-    """SMPL's joints that are markers on it."""
+    """SMPL's joints that are markers on the segment."""
     to_smpl: Rotation = dataclasses.field(default_factory=lambda: np.eye(3))
-    """Rotation from its axes to those of SMPL's joint (x forward, y up, z right)."""
+    """Rotation from the segment's axes to those of SMPL's joint (x forward, y up, z
+    right)."""
 
 
 def _leg(side: str, hip: int, outward: bool) -> list[Segment]:
@@ -88,7 +90,7 @@ def _arm(side: str, shoulder: int, outward: bool) -> list[Segment]:
     shoulders = named(("arm_flex", _Z), ("arm_add", x), ("arm_rot", y))
     elbows = named(("elbow_flex", _Z), ("pro_sup", y))
     wrists = named(("wrist_flex", _Z), ("wrist_dev", x))
-    humerus, forearm, down = f"humerus_{side}", f"forearm_{side}", _HANGING[side]
+    humerus, forearm, down = f"humerus_{side}", f"forearm_{side}", _ARM_ROTATIONS[side]
     return [
         Segment(humerus, "torso", shoulder, shoulder, shoulders, (elbow,), down),
         Segment(forearm, humerus, elbow, elbow, elbows, (wrist,), down),
@@ -114,19 +116,21 @@ TRANSLATIONS = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
 
 @dataclasses.dataclass(frozen=True)
 class Marker:
-    """A point of a segment that inverse kinematics follows."""
+    """A point on a segment that inverse kinematics follows."""
 
     name: str
     segment: Segment
     joint: int
-    """SMPL's joint from which it is counted."""
+    """SMPL's joint that is the origin of `offset`."""
     offset: Float[np.ndarray, " 3"]
-    """From that joint, m, along the axes of SMPL's joint `turns_with` (x forward)."""
+    """Offset from that joint, m, along the axes of SMPL's joint `turns_with` (x
+    forward)."""
     weight: float
 
 
 def markers() -> list[Marker]:
-    """The markers of all segments: joint centres, and two beside each segment."""
+    """Returns the markers of all segments: joint centres, and two additional ones per
+    segment."""
     found = []
     for segment in SEGMENTS:
         trunk = segment.name == "torso"
@@ -136,7 +140,7 @@ def markers() -> list[Marker]:
             found.append(Marker(name, segment, joint, np.zeros(3), weight))
         anchor = segment.turns_with if trunk else segment.joint
         for name, axis in (("front", _X), ("right", _Z)):
-            offset = segment.to_smpl @ (_CLUSTER_M * np.array(axis, float))
+            offset = segment.to_smpl @ (_CLUSTER_DISTANCE_M * np.array(axis, float))
             label = f"{segment.name}_{name}"
             found.append(Marker(label, segment, anchor, offset, _CLUSTER_WEIGHT))
     return found
@@ -171,8 +175,8 @@ def write(path: Path, scene: Scene) -> None:
 def world_orientations(
     poses: Float[np.ndarray, "t 24 3"],
 ) -> Float[np.ndarray, "t 24 3 3"]:
-    """Orientations of SMPL's joints in the world, with x forward, y up and z right as
-    the columns' axes at rest."""
+    """Returns the orientations of SMPL's joints in the world, with x forward, y up and
+    z right as the axes (columns) at rest."""
     local = so3.exp(poses)
     world = np.array(local)
     for joint in range(1, 24):
@@ -224,7 +228,8 @@ def model(
 
 
 def _start(turn: Rotation, place: Float[np.ndarray, " 3"]) -> dict[str, float]:
-    """Values of the pelvis' coordinates: `turn = Ry(rotation) Rx(list) Rz(tilt)`."""
+    """Returns the values of the pelvis' coordinates:
+    `turn = Ry(rotation) Rx(list) Rz(tilt)`."""
     values = {
         "pelvis_rotation": np.arctan2(turn[0, 2], turn[2, 2]),
         "pelvis_list": np.arcsin(np.clip(-turn[1, 2], -1.0, 1.0)),
@@ -286,7 +291,7 @@ def _add_axis(
 
 
 def _set_up(first: float, last: float) -> ElementTree.Element:
-    """The set-up of inverse kinematics between two times, s."""
+    """Returns the set-up of inverse kinematics between two times, s."""
     root = ElementTree.Element("OpenSimDocument", Version="40000")
     tool = _add(root, "InverseKinematicsTool", name="bodyslam")
     _add(tool, "results_directory", ".")

@@ -35,6 +35,7 @@ class Views:
 
     @property
     def zooms(self) -> bool:
+        """Whether each view has intrinsics of its own."""
         return len(self.intrinsics) > 1
 
 
