@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from bodyslam_jax.geometry.lengths import LENGTHS
 from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
 from bodyslam_jax.graph.factors.human_motion import HumanMotion
@@ -28,11 +29,16 @@ from bodyslam_jax.graph.globals import (
     split,
     vector_of,
 )
-from bodyslam_jax.graph.layout import Layout, make_layout
+from bodyslam_jax.graph.layout import (
+    Layout,
+    Tracks,
+    layouts_of_one_size,
+    make_layout,
+)
 from bodyslam_jax.graph.memory import check_memory
 from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.padding import Masked, check_padding, extend
-from bodyslam_jax.graph.sizes import is_dense
+from bodyslam_jax.graph.sizes import LANDMARKS, is_dense
 from bodyslam_jax.graph.state import TURNS, State, Step, gauge
 from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation import (
@@ -385,6 +391,19 @@ def layout_of(
     **Raises:** `ValueError` for two `Reprojection` or `MarginalPrior`, and for priors
     of landmarks without an observation.
     """
+    frame, landmark, front = _tracks_of(factors)
+    for factor in factors:
+        if isinstance(factor, LandmarkPrior):
+            check_prior(factor, landmark)
+    if common_sizes is None:
+        common_sizes = not is_dense(sizes["t"], sizes["l"], sizes["h"])
+    given = sizes["t"], sizes["l"], frame, landmark, sizes["h"]
+    return make_layout(*given, common_sizes=common_sizes, front=front)
+
+
+def _tracks_of(factors: Sequence[Factor]) -> tuple[np.ndarray, np.ndarray, int]:
+    """Frame and landmark of each observation, and the number of chunks that a
+    `MarginalPrior` couples."""
     priors = [f for f in factors if isinstance(f, MarginalPrior)]
     if len(priors) > 1:
         raise ValueError(f"factors: {len(priors)} `MarginalPrior`, expected one.")
@@ -396,13 +415,31 @@ def layout_of(
         )
     frame = np.asarray(tracks[0].frame) if tracks else np.zeros(0, int)
     landmark = np.asarray(tracks[0].landmark) if tracks else np.zeros(0, int)
-    for factor in factors:
-        if isinstance(factor, LandmarkPrior):
-            check_prior(factor, landmark)
-    if common_sizes is None:
-        common_sizes = not is_dense(sizes["t"], sizes["l"], sizes["h"])
-    given = sizes["t"], sizes["l"], frame, landmark, sizes["h"]
-    return make_layout(*given, common_sizes=common_sizes, front=front)
+    return frame, landmark, front
+
+
+def in_one_layout(cases: Sequence[tuple[Problem, State]]) -> list[Problem]:
+    """The same problems with layouts of equal shapes, the least that holds them all.
+
+    **Raises:** `ValueError` if no common size holds each of them.
+    """
+    tracks = []
+    for problem, state in cases:
+        frame, landmark, front = _tracks_of(problem.factors)
+        size = len(state.cameras), len(state.landmarks)
+        tracks.append(Tracks(*size, frame, landmark, front))
+    layouts = layouts_of_one_size(tracks)
+    if layouts is None:
+        frames, landmarks = max(t[0] for t in tracks), max(t[1] for t in tracks)
+        raise ValueError(
+            f"cases: up to {frames} frames and {landmarks} landmarks, expected what "
+            f"fits one of the common sizes, of up to {LENGTHS[-1]} frames with "
+            f"{LANDMARKS} landmarks for each {CHUNK}; or tracks are too long for it."
+        )
+    return [
+        dataclasses.replace(problem, layout=layout)
+        for (problem, _), layout in zip(cases, layouts, strict=True)
+    ]
 
 
 def _sample_state(free: Step) -> State:

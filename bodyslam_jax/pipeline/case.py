@@ -65,8 +65,16 @@ class Case:
         """Cameras and people of a state, to be compared with `truth` by `evaluate`.
 
         Differentiates and maps over states. People are present where they are in the
-        truth; the world is the map's, in metres.
+        truth; the world is the map's, in metres. Frames beyond those of the truth, as
+        `stack_cases` adds them, are left out.
         """
+        num_frames = self.truth.present.shape[1]
+        state = dataclasses.replace(
+            state,
+            cameras=state.cameras[:num_frames],
+            roots=state.roots[:, :num_frames],
+            poses=state.poses[:, :num_frames],
+        )
         return trajectories(
             state,
             self.body,
