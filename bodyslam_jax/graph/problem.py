@@ -40,6 +40,7 @@ from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.padding import Masked, check_padding, extend
 from bodyslam_jax.graph.sizes import LANDMARKS, is_dense
 from bodyslam_jax.graph.state import TURNS, State, Step, gauge
+from bodyslam_jax.graph.terms import TermCosts, names_of_terms
 from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation import (
     Sizes,
@@ -120,25 +121,18 @@ class Problem(eqx.Module):
         costs = self.cost_by_term(state, held=held).values()
         return sum(costs, jnp.zeros_like(state.scale))
 
-    def cost_by_term(
-        self, state: State, *, held: bool = False
-    ) -> dict[str, Float[Array, ""]]:
-        """The cost of each factor, by the name of its class; `held` as in `cost`."""
+    def cost_by_term(self, state: State, *, held: bool = False) -> TermCosts:
+        """The cost of each term, by its name (`graph/terms.py`); `held` as in `cost`.
+        A `dict`, in which names of factors' classes are understood, too."""
         problem = self if held else self.refresh(state)
         costs = [factor.cost(state) for factor in problem.factors]
-        return dict(zip(self.names, costs, strict=True))
+        return TermCosts(zip(self.names, costs, strict=True))
 
     @property
     def names(self) -> list[str]:
-        """Names of the terms: those of the factors' classes, numbered from the second
-        factor of a class on."""
-        names: list[str] = []
-        for factor in self.factors:
-            inner = factor.factor if isinstance(factor, Masked) else factor
-            name = type(inner).__name__
-            taken = sum(other.split("_")[0] == name for other in names)
-            names.append(f"{name}_{taken + 1}" if taken else name)
-        return names
+        """The name of each factor's term, as in `weights`: `human_motion`, `keypoints`,
+        numbered from the second term of a name on (`graph/terms.py`)."""
+        return names_of_terms(self.factors)
 
     def predict(self, state: State, *, frozen: bool = True) -> Any:
         """The motion model's prediction at a state; `None` without a motion model.
