@@ -321,7 +321,7 @@ class OwnFactor:
     """How a factor that a user added to the joint problem fits its optimum."""
 
     name: str
-    """Of its class, numbered from the second factor of a class on."""
+    """Of its term, as in `Problem.names`."""
     residuals: int
     """Number of whitened residuals that are not missing."""
     cost: float

@@ -9,7 +9,6 @@ import sys
 import types
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 import tyro
@@ -155,7 +154,6 @@ def test_what_is_run_and_where_it_goes_is_the_first_line(
         "bodyslam_jax.pipeline.run_to_folder",
         lambda *_: types.SimpleNamespace(summary=summary),
     )
-    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.compiles_first", lambda: False)
     monkeypatch.chdir(tmp_path)
     code, out, _ = _run(monkeypatch, capsys, "run", "walk.mp4")
     assert code == 0
@@ -328,18 +326,6 @@ def test_a_dataset_becomes_a_sequence_folder(monkeypatch, capsys, tmp_path):
     assert code == 1 and "none.pkl: not there; 3DPW is given to researchers" in err
     assert not (tmp_path / "other").exists()
     assert _run(monkeypatch, capsys, "convert-dataset", "nosuch")[0] == 2
-
-
-def test_programs_are_compiled_first_where_none_is_kept(tmp_path):
-    kept = jax.config.jax_compilation_cache_dir
-    try:
-        jax.config.update("jax_compilation_cache_dir", str(tmp_path / "compiled"))
-        assert jax_setup.compiles_first()
-        (tmp_path / "compiled").mkdir()
-        (tmp_path / "compiled" / "program").write_text("compiled")
-        assert not jax_setup.compiles_first()
-    finally:
-        jax.config.update("jax_compilation_cache_dir", kept)
 
 
 def test_how_to_compile_is_set_once_where_it_is_known(monkeypatch):

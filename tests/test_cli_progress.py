@@ -14,7 +14,8 @@ import pytest
 from rich.console import Console
 
 from bodyslam_jax.cli import main, progress
-from bodyslam_jax.pipeline.progress import Counter, Stopwatch
+from bodyslam_jax.pipeline import progress as stages
+from bodyslam_jax.pipeline.progress import Counter, Stopwatch, compiling, counted
 
 PACKAGE = logging.getLogger("bodyslam_jax")
 
@@ -78,6 +79,77 @@ def test_a_bar_shows_the_stage_and_leaves_its_last_line(records):
     last = [line for line in shown.splitlines() if "cameras: " in line]
     assert len(last) == 1 and last[0].rstrip().endswith(" s")
     assert "\x1b[?25h" in shown  # The cursor is shown again.
+
+
+@pytest.fixture
+def programs(tmp_path):
+    """A folder of compiled programs, empty at first."""
+    kept = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "compiled"))
+    yield tmp_path / "compiled"
+    jax.config.update("jax_compilation_cache_dir", kept)
+
+
+def compiled_stage(watch, size, seconds=9.0):
+    with watch("joint"), compiling("joint", size):
+        PACKAGE.info("working")
+        # As JAX reports what its compiler took.
+        jax.monitoring.record_event_duration_secs(COMPILED, seconds)
+
+
+COMPILED = "/jax/core/compile/backend_compile_duration"
+
+
+def test_compiling_is_said_before_the_stage_and_once(records, programs):
+    said = lambda: [r.getMessage() for r in records if "seconds" not in vars(r)]
+    compiled_stage(Stopwatch(), "60 frames, 1 people")
+    expected = "joint: compiling, about 26 s, once"
+    assert said() == ["joint ...", expected, "working"]
+    records.clear()
+    compiled_stage(Stopwatch(), "60 frames, 1 people")
+    assert said() == ["joint ...", "working"]
+    records.clear()
+    # Programs of another size take about what those took.
+    compiled_stage(Stopwatch(), "120 frames, 1 people")
+    assert said()[1] == "joint: compiling, about 9 s, once"
+    records.clear()
+    # Programs that were deleted are compiled again, and so is said.
+    for file in programs.iterdir():
+        file.write_text("{broken")
+    compiled_stage(Stopwatch(), "60 frames, 1 people")
+    assert said()[1] == expected
+
+
+def test_without_a_folder_of_programs_a_process_says_it_once(records, monkeypatch):
+    monkeypatch.setattr(stages, "_of_process", {})
+    kept = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    try:
+        for _ in range(2):
+            compiled_stage(Stopwatch(), "60 frames, 1 people")
+    finally:
+        jax.config.update("jax_compilation_cache_dir", kept)
+    lines = [r.getMessage() for r in records]
+    assert [x for x in lines if "about" in x] == ["joint: compiling, about 26 s"]
+
+
+def test_a_bar_leaves_the_line_about_compiling_above_it(records, programs):
+    compiled_stage(Stopwatch(), "60 frames, 1 people")
+    bar, out = progress.Bar(), io.StringIO()
+    bar._console = Console(file=out, force_terminal=True, highlight=False)
+    for record in records[:2]:
+        bar.handle(record)
+    assert bar._bar is not None
+    bar.close()
+    assert "joint: compiling, about 26 s, once" in out.getvalue()
+
+
+def test_a_stage_that_goes_through_frames_counts_them(records):
+    with Stopwatch()("overlay"):
+        for k in counted(range(3), "overlay", 3):
+            time.sleep(0.15 if k == 0 else 0.21)
+    done = [r.done for r in records if hasattr(r, "done")]
+    assert done[-1] == 3 and all(r.stage == "overlay" for r in records)
 
 
 def test_general_options_are_taken_from_any_place():

@@ -97,12 +97,12 @@ def test_variants_leave_out_and_add_what_they_say(scene):
     also = g.make_problem([*problem.factors, prior], start, motion=predictor)
     blind, _ = experiments.VARIANTS["no landmarks"](also, start)
     found = blind.cost_by_term(start, held=True)
-    assert found["Reprojection"] == found["LandmarkPrior"] == 0
+    assert found["landmarks"] == found["landmark_prior"] == 0
     assert not blind.free.landmarks.any() and blind.free.cameras.any()
     apart, _ = experiments.VARIANTS["no places seen again"](also, start)
     assert apart.cost_by_term(start, held=True) == {
         **also.cost_by_term(start, held=True),
-        "LandmarkPrior": 0,
+        "landmark_prior": 0,
     }
     # Nothing of the kind is there to be left out.
     for name in ("no places seen again", "no ground", "no smooth path"):
@@ -134,15 +134,17 @@ def test_weights_scale_residuals_and_missing_stays_missing(scene):
     problem, _, start = scene
     names = experiments.names_of(problem)
     assert set(names) == {
-        "keypoint",
-        "keypoint loss",
-        "motion",
-        "posture",
+        "keypoints",
+        "keypoints loss",
+        "human_motion",
+        "body_pose",
         "shape",
-        "landmark",
-        "landmark loss",
+        "landmarks",
+        "landmarks loss",
     }
-    log = jnp.log(2.0) * jnp.array([float(n in ("motion", "shape")) for n in names])
+    log = jnp.log(2.0) * jnp.array(
+        [float(n in ("human_motion", "shape")) for n in names]
+    )
 
     @jax.jit
     def costs(log):
@@ -151,11 +153,11 @@ def test_weights_scale_residuals_and_missing_stays_missing(scene):
 
     before, after = costs(jnp.zeros(len(names))), costs(log)
     for name, value in before.items():
-        share = 4.0 if name in ("HumanMotion", "ShapePrior") else 1.0
+        share = 4.0 if name in ("human_motion", "shape") else 1.0
         np.testing.assert_allclose(value, share * after[name], rtol=1e-12)
     slope = jax.jit(jax.grad(lambda log: sum(costs(log).values())))
     assert np.isfinite(slope(jnp.zeros(len(names)))).all()
-    twice = experiments.reweighted(problem, ("keypoint",), jnp.log(jnp.array([2.0])))
+    twice = experiments.reweighted(problem, ("keypoints",), jnp.log(jnp.array([2.0])))
     old, new = problem.factors[1].sigma, twice.factors[1].sigma
     assert np.isinf(new)[np.isinf(old)].all()
     with pytest.raises(ValueError, match="nosuch"):
@@ -185,7 +187,7 @@ def test_learning_goes_on_after_an_interruption(scene, tmp_path, monkeypatch):
     body, there = scenes.body_model(), jnp.ones((1, 12), bool)
     seen = trajectories(truth, body, there, there[0], jnp.asarray(30.0))
     trials = [experiments.Trial(problem, start, seen, body, there[0])] * 2
-    names = ("motion", "shape")
+    names = ("human_motion", "shape")
     learn = lambda steps, **kw: experiments.learn_weights(
         trials, steps=steps, names=names, **kw
     )
@@ -206,7 +208,9 @@ def test_learning_goes_on_after_an_interruption(scene, tmp_path, monkeypatch):
     assert len(calls) == 6
 
     with pytest.raises(ValueError, match="progress.npz.*motion"):
-        experiments.learn_weights(trials, names=("motion", "posture"), progress=file)
+        experiments.learn_weights(
+            trials, names=("human_motion", "body_pose"), progress=file
+        )
     file.write_bytes(b"PK cut short")
     np.testing.assert_array_equal(learn(6, progress=file).path, whole.path)
 

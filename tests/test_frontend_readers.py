@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.config import Association
 from bodyslam_jax.io import read_sequence
+from bodyslam_jax.io.bodies.body_format import body_formats
 from bodyslam_jax.io.bodies.perspective import crop_camera, full_translation
 from bodyslam_jax.io.bodies.reader import read_bodies
 from bodyslam_jax.io.camera.calibration import (
@@ -26,9 +27,11 @@ from bodyslam_jax.io.camera.calibration import (
     rays,
     read_camera,
 )
+from bodyslam_jax.io.formats import Source
 from bodyslam_jax.io.frame_index import gap_among
 from bodyslam_jax.io.keypoints.associate import associate
-from bodyslam_jax.io.keypoints.layouts import to_body25
+from bodyslam_jax.io.keypoints.keypoint_format import keypoint_formats
+from bodyslam_jax.io.keypoints.layouts import from_layout, usual_layout
 from bodyslam_jax.io.keypoints.reader import read_detections
 from bodyslam_jax.io.safe_pickle import restricted_load
 from bodyslam_jax.types import Intrinsics, Keypoints
@@ -112,20 +115,27 @@ def test_a_point_without_confidence_is_missing_not_at_the_origin(tmp_path):
     np.testing.assert_array_equal(found[0][0, 4], 0.0)
 
 
+def in_usual_order(points: np.ndarray) -> np.ndarray:
+    """BODY_25 of keypoints in the usual layout of as many."""
+    layout = usual_layout(len(points))
+    assert layout is not None
+    return from_layout(points, layout.parts)
+
+
 def test_layouts_agree_on_the_body():
     """Each layout's left wrist, neck and middle of the hips, at their BODY_25 index."""
     points = lambda n: np.stack([np.arange(n), 2.0 * np.arange(n), np.ones(n)], axis=-1)
-    coco18 = to_body25(Path("a"), points(18))
+    coco18 = in_usual_order(points(18))
     assert coco18[7, 0] == 7 and coco18[1, 0] == 1
     assert coco18[8, 0] == (8 + 11) / 2 and coco18[19:, 2].max() == 0
-    coco17 = to_body25(Path("a"), points(17))
+    coco17 = in_usual_order(points(17))
     assert coco17[7, 0] == 9 and coco17[1, 0] == (5 + 6) / 2 and coco17[12, 0] == 11
-    halpe = to_body25(Path("a"), points(26))
+    halpe = in_usual_order(points(26))
     assert halpe[7, 0] == 9 and halpe[1, 0] == 18 and halpe[8, 0] == 19
     assert halpe[19:, 0].tolist() == [20, 22, 24, 21, 23, 25]
-    np.testing.assert_array_equal(to_body25(Path("a"), points(25)), points(25))
-    np.testing.assert_array_equal(to_body25(Path("a"), points(136)), halpe)
-    whole = to_body25(Path("a"), points(133))
+    np.testing.assert_array_equal(in_usual_order(points(25)), points(25))
+    np.testing.assert_array_equal(in_usual_order(points(136)), halpe)
+    whole = in_usual_order(points(133))
     np.testing.assert_array_equal(whole[:19], coco17[:19])
     assert whole[19:, 0].tolist() == [17, 18, 19, 20, 21, 22]
 
@@ -169,7 +179,7 @@ def test_json_of_other_detectors(tmp_path, kind):
     file.write_text(json.dumps(JSON_FILES[kind]))
     found = detections(file)
     assert [len(f) for f in found] == [1] * NUM
-    np.testing.assert_allclose(found[-1][0], to_body25(file, person()[:17]))
+    np.testing.assert_allclose(found[-1][0], in_usual_order(person()[:17]))
 
 
 def test_generic_archive(tmp_path):
@@ -210,7 +220,10 @@ BAD_KEYPOINTS = {
     "missing": (lambda folder: folder / "nothing", "no such file"),
     "empty folder": (lambda folder: folder, "no \\*_keypoints.json"),
     "text": (_text("a.json", "hello"), "line 1: not JSON"),
-    "unknown json": (_text("a.json", '{"a": 1}'), "neither AlphaPose"),
+    "unknown json": (
+        _text("a.json", '{"a": 1}'),
+        "not keypoints of .*AlphaPose, COCO, MMPose or easy_ViTPose, but ..a.",
+    ),
     "nobody": (_other([[]] * NUM), "no person"),
     "all missing": (_other([[person() * [1, 1, 0]]] * NUM), "all confidences are zero"),
     "nan": (_other([[_nan()]] * NUM), "NaN or infinity"),
@@ -576,6 +589,20 @@ def test_bodies_of_other_tools(tmp_path, tool):
     assert found.shapes_regressed == (tool not in ("SLAHMR", "AMASS"))
     if tool not in ("GVHMR", "PromptHMR", "SLAHMR", "AMASS"):
         np.testing.assert_array_equal(found.shapes[0], expected["betas"])
+
+
+def test_each_file_is_of_one_format_only(tmp_path):
+    """So that the order in which formats are asked does not matter."""
+    recognised = lambda formats, content: [
+        f.name for f in formats if f.recognises(Source(tmp_path / "file", content))
+    ]
+    contents = {tool: content for tool, (_, content) in _tool_files().items()}
+    contents["bodies.npz"] = bodies()
+    for tool, content in contents.items():
+        assert recognised(body_formats(), content) == [tool]
+    names = {"alphapose": "AlphaPose", "coco": "COCO", "mmpose": "MMPose"}
+    for kind, content in JSON_FILES.items():
+        assert recognised(keypoint_formats(), content) == [names[kind]]
 
 
 def test_what_is_mostly_not_finite_is_refused_of_any_tool(tmp_path):

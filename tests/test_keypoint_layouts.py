@@ -99,7 +99,7 @@ ORDERS = [(n, name) for n, layouts in LAYOUTS.items() for name in layouts]
 @pytest.mark.parametrize("as_folder", [False, True])
 @pytest.mark.parametrize(("num", "name"), ORDERS)
 def test_an_order_is_told_by_who_is_near_whom(tmp_path, num, name, as_folder):
-    layout = LAYOUTS[num][name]
+    layout = LAYOUTS[num][name].parts
     points = walk(layout)
     make = openpose if as_folder else lambda p, a: archive(p.with_suffix(".npz"), a)
     found, said = read(make(tmp_path / "k", points))
@@ -109,7 +109,7 @@ def test_an_order_is_told_by_who_is_near_whom(tmp_path, num, name, as_folder):
 
 
 def test_people_without_a_face_are_told_too(tmp_path):
-    layout = LAYOUTS[25]["BODY_25B"]
+    layout = LAYOUTS[25]["BODY_25B"].parts
     points = walk(layout, behind=True, face=False)
     points[:, [3, 4]] = 0.0  # ears
     found, said = read(archive(tmp_path / "k.npz", points))
@@ -131,7 +131,7 @@ def test_an_order_that_is_no_bodys_is_not_taken_in_silence(tmp_path, seed):
 
 def test_what_does_not_move_is_left_in_the_usual_order(tmp_path):
     """As points on a line, or made up, which say nothing of an order."""
-    points = np.tile(walk(LAYOUTS[25]["BODY_25B"])[:1], (NUM, 1, 1))
+    points = np.tile(walk(LAYOUTS[25]["BODY_25B"].parts)[:1], (NUM, 1, 1))
     found, said = read(archive(tmp_path / "k.npz", points))
     np.testing.assert_allclose(found, points)
     assert said == []
@@ -236,7 +236,7 @@ def test_names_of_human36m_in_mmpose():
     names += " thorax neck_base head left_shoulder left_elbow left_wrist"
     names += " right_shoulder right_elbow right_wrist"
     layout = layout_of(names.split())
-    usual = LAYOUTS[17]["Human3.6M"]
+    usual = LAYOUTS[17]["Human3.6M"].parts
     assert layout is not None and layout[:9] == usual[:9] and layout[11:] == usual[11:]
     assert layout_of(["a", "b"]) is None
     assert names_in({"skeleton": [[0, 1], [1, 2]]}) is None
@@ -260,7 +260,7 @@ def test_x_and_y_exchanged_are_told_from_people_who_lie(tmp_path, behind):
 
 def test_the_order_of_a_tool_that_writes_rows_first_says_it_too(tmp_path):
     """Also of people of whom nothing tells front from back."""
-    layout = LAYOUTS[25]["ViTPose with feet"]
+    layout = LAYOUTS[25]["ViTPose with feet"].parts
     points = walk(layout)
     points[:, [19, 20, 21, 22, 23, 24], 2] = 0.0
     found, said = read(archive(tmp_path / "k.npz", points[..., [1, 0, 2]]))

@@ -123,11 +123,34 @@ def test_weights_are_inverse_variances_by_term(built):
     np.testing.assert_allclose(found["keypoints"], 0.5, rtol=1e-12)
     # The cost of a term is λ times its robust loss, and other terms stay.
     before, after = (p.cost_by_term(state) for p in (problem, changed))
-    terms = {"HumanMotion": "human_motion", "KeypointReprojection": "keypoints"}
-    for term, name in terms.items():
+    for name in ("human_motion", "keypoints"):
         ratio = found[name] / weights[name]
-        np.testing.assert_allclose(after[term] / before[term], ratio, rtol=1e-9)
-    assert after["RootSmoothness"] == before["RootSmoothness"] > 0
+        np.testing.assert_allclose(after[name] / before[name], ratio, rtol=1e-9)
+    assert after["root_smoothness"] == before["root_smoothness"] > 0
+
+
+def test_a_term_has_one_name_everywhere(built):
+    problem, state = built
+    terms = problem.cost_by_term(state)
+    assert problem.names == list(terms)
+    assert set(bs.weights(problem)) <= set(terms)
+
+
+def test_names_of_classes_are_understood_and_the_new_one_is_said(built):
+    problem, state = built
+    terms = problem.cost_by_term(state)
+    with pytest.warns(DeprecationWarning, match="is called 'human_motion' now"):
+        assert terms["HumanMotion"] == terms["human_motion"]
+    with pytest.warns(DeprecationWarning, match="is called 'keypoints'"):
+        old = bs.with_weights(problem, KeypointReprojection=0.5)
+    assert float(bs.weights(old)["keypoints"]) == pytest.approx(0.5)
+    with pytest.raises(KeyError, match="no term 'Nothing', expected among"):
+        terms["Nothing"]
+    # Costs map, stack and compare as those of a `dict`.
+    doubled = jax.tree.map(lambda x: 2 * x, terms)
+    assert float(doubled["shape"]) == 2 * float(terms["shape"])
+    mapped = jax.vmap(lambda f: jax.tree.map(lambda x: f * x, terms))(jnp.ones(3))
+    assert list(mapped) == list(terms) and mapped["shape"].shape == (3,)
 
 
 @pytest.mark.slow
@@ -157,10 +180,10 @@ def test_the_cost_by_term_is_a_differentiable_sum(built):
     problem, state = built
     terms = problem.cost_by_term(state)
     np.testing.assert_allclose(sum(terms.values()), problem.cost(state))
-    slope = jax.grad(lambda s: problem.cost_by_term(s)["HumanMotion"])(state)
+    slope = jax.grad(lambda s: problem.cost_by_term(s)["human_motion"])(state)
     assert np.isfinite(slope.scale) and slope.scale != 0
     cost_of = lambda lam: bs.with_weights(problem, human_motion=lam).cost(state)
-    expected = terms["HumanMotion"] / bs.weights(problem)["human_motion"]
+    expected = terms["human_motion"] / bs.weights(problem)["human_motion"]
     np.testing.assert_allclose(jax.grad(cost_of)(2.0), expected, rtol=1e-9)
 
 
@@ -224,7 +247,7 @@ def test_the_cost_does_not_depend_on_the_unit_of_the_map(built):
         found = costs_of(factor)
         for term, cost in expected.items():
             np.testing.assert_allclose(found[term], cost, rtol=1e-9, err_msg=term)
-    assert {"GroundContact", "LandmarkPrior"} <= set(expected)
+    assert {"ground", "landmark_prior"} <= set(expected)
     larger, start = bs.rescaled(problem, state, 2.0)
     assert larger.cost(start) > problem.cost(state) + 1
 
@@ -318,7 +341,7 @@ def test_a_position_sensor_determines_the_scale(built):
     report = bs.check_factor(factor, state)
     assert report.residual_shape == (FRAMES, 3)
     more = problem.with_factors(factor)
-    assert more.names[-1] == "CameraPosition"
+    assert more.names[-1] == "camera_position"
     assert bs.weights(more)["camera_position"] == pytest.approx(1e4)
     solution = bs.solve(more, state)
     assert solution.status == "converged"
@@ -543,10 +566,10 @@ def test_run_takes_factors_and_variables(case):
     assert result.summary["scale"]["sigma"] < 0.01 * result.scale
     assert abs(late["value"][0] - 0.5) < 3 * late["sigma"][0] + 0.1
     assert late["given_sigma"] == [1.0]
-    assert own["factors"]["LateClock"]["rms"] < 2
+    assert own["factors"]["late_clock"]["rms"] < 2
     assert "own_factor" not in [reason["name"] for reason in result.summary["reasons"]]
     wrong = found(0.3).summary
-    assert wrong["own"]["factors"]["LateClock"]["rms"] > 3
+    assert wrong["own"]["factors"]["late_clock"]["rms"] > 3
     assert wrong["status"] == "doubtful"
     assert "own_factor" in [reason["name"] for reason in wrong["reasons"]]
 

@@ -69,6 +69,22 @@ LEVELS: tuple[tuple[int, ...], ...] = (
 """Joints by depth in the kinematic tree."""
 
 
+_NECK, _HEAD = JOINT_NAMES.index("neck"), JOINT_NAMES.index("head")
+_HEAD_ABOVE, _HEAD_RADIUS = 0.35, 1.2
+"""Middle of the head above its joint, and half its height, in lengths from the joint of
+the neck to that of the head: of the vertices of the default body's head."""
+
+
+def head_ball(
+    joints: Float[np.ndarray, "*b 24 3"],
+) -> tuple[Float[np.ndarray, "*b 3"], Float[np.ndarray, "*b"]]:
+    """Middle and radius of a ball about the head, in the unit of the joints; SMPL's
+    last joint of it is at its lower end."""
+    up = joints[..., _HEAD, :] - joints[..., _NECK, :]
+    radius = np.asarray(_HEAD_RADIUS * np.linalg.norm(up, axis=-1))
+    return joints[..., _HEAD, :] + _HEAD_ABOVE * up, radius
+
+
 def ancestors() -> Float[np.ndarray, "24 24"]:
     """Returns 1 where the row's joint is the column's joint or one of its ancestors."""
     above = np.eye(24)

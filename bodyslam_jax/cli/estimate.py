@@ -7,7 +7,7 @@ from typing import Any
 
 import tyro
 
-from bodyslam_jax.cli import jax_setup, unexpected
+from bodyslam_jax.cli import unexpected
 from bodyslam_jax.cli.types import Flat, Input, Preset
 from bodyslam_jax.config import Config
 
@@ -160,5 +160,3 @@ def evaluate(
 def _announce(what: str, out: Path) -> None:
     """Logs what is run and where the result goes."""
     log.info("%s -> %s", what, out)
-    if jax_setup.compiles_first():
-        log.info("first run: compiling takes minutes; later runs use the same programs")

@@ -4,8 +4,6 @@ import gc
 import importlib.metadata
 import logging
 import os
-from pathlib import Path
-from typing import Any
 
 from bodyslam_jax.batch.program_cache import user_folder
 from bodyslam_jax.cli import interrupts
@@ -50,15 +48,6 @@ def set_compiler_flags() -> None:
     given = os.environ.get("XLA_FLAGS", "")
     if importlib.metadata.version("jaxlib").startswith("0.10.") and flag not in given:
         os.environ["XLA_FLAGS"] = f"{given} {flag}=false".strip()
-
-
-def compiles_first() -> bool:
-    """Whether the cache of compiled programs is empty."""
-    import jax
-
-    options: Any = jax.config  # whose class declares no options
-    folder = options.jax_compilation_cache_dir
-    return bool(folder) and not (Path(folder).is_dir() and any(Path(folder).iterdir()))
 
 
 def _choose_device(device: str | None) -> None:

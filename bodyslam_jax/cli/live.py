@@ -61,6 +61,7 @@ def live(
     from bodyslam_jax.io.camera.calibration import read_camera
     from bodyslam_jax.io.capture import Capture
     from bodyslam_jax.online import Online
+    from bodyslam_jax.pipeline.progress import compiling
 
     _check(config)
     capture = Capture(source, config.fps)
@@ -71,8 +72,9 @@ def live(
         export.check_folder(out, {"name": name}, None)
         online = Online(config, intrinsics=intrinsics, fps=capture.fps, name=name)
         log.info("live: %s at %.3g frames a second -> %s", source, capture.fps, out)
-        log.info("compiling; minutes the first time, seconds later")
-        online.prepare(capture.size)
+        width, height = capture.size
+        with compiling("live", f"{width}x{height} px"):
+            online.prepare(capture.size)
         shown = _page(page, port, open)
         try:
             with interrupts.as_event() as stop:

@@ -8,6 +8,7 @@ the scale of a robust loss: λ = σ^-2, so log λ decreases by twice as much.
 
 import dataclasses
 import logging
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -31,20 +32,32 @@ from bodyslam_jax.pipeline.joint_problem import Prepared
 
 log = logging.getLogger(__name__)
 WEIGHTS: dict[str, tuple[type[graph.Factor], str]] = {
-    "keypoint": (graph.KeypointReprojection, "sigma"),
-    "keypoint loss": (graph.KeypointReprojection, "loss"),
-    "motion": (graph.HumanMotion, "whitening"),
-    "posture": (graph.BodyPosePrior, "sigma"),
+    "keypoints": (graph.KeypointReprojection, "sigma"),
+    "keypoints loss": (graph.KeypointReprojection, "loss"),
+    "human_motion": (graph.HumanMotion, "whitening"),
+    "body_pose": (graph.BodyPosePrior, "sigma"),
     "shape": (graph.ShapePrior, "sigma"),
-    "orientation": (graph.RootOrientation, "sigma"),
-    "turning": (graph.AngularAccelerationPrior, "sigma"),
+    "root_orientation": (graph.RootOrientation, "sigma"),
+    "angular_acceleration": (graph.AngularAccelerationPrior, "sigma"),
     "upright": (graph.UprightPrior, "sigma"),
-    "smooth path": (graph.RootSmoothness, "sigma"),
+    "root_smoothness": (graph.RootSmoothness, "sigma"),
     "ground": (graph.GroundContact, "sigma"),
-    "landmark": (graph.Reprojection, "sigma"),
-    "landmark loss": (graph.Reprojection, "loss"),
+    "landmarks": (graph.Reprojection, "sigma"),
+    "landmarks loss": (graph.Reprojection, "loss"),
 }
-"""Type and field of the factor that each weight multiplies."""
+"""The field of a factor that each weight multiplies, by the name of its term."""
+_RENAMED = {
+    "keypoint": "keypoints",
+    "keypoint loss": "keypoints loss",
+    "motion": "human_motion",
+    "posture": "body_pose",
+    "orientation": "root_orientation",
+    "turning": "angular_acceleration",
+    "smooth path": "root_smoothness",
+    "landmark": "landmarks",
+    "landmark loss": "landmarks loss",
+}
+"""Terms by their names in files written before terms had one name everywhere."""
 SCALE_UNIT, JOINT_UNIT_M = 0.05, 0.05
 """Units of the training error: of log s, and of J-ATE."""
 SCHEDULE = (solver.Stage(),)
@@ -115,6 +128,10 @@ def reweighted(
 
     **Raises:** `InputError` for a name that is not among `WEIGHTS`.
     """
+    for old in [name for name in names if name in _RENAMED]:
+        text = f"weights: {old!r} is called {_RENAMED[old]!r} now."
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+    names = [_RENAMED.get(name, name) for name in names]
     unknown = set(names) - set(WEIGHTS)
     if unknown:
         raise InputError(f"weights {sorted(unknown)}, expected of {list(WEIGHTS)}.")

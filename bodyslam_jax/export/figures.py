@@ -13,8 +13,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
+from bodyslam_jax.body.skeleton import head_ball
 from bodyslam_jax.diagnostics.statistics import PathStatistics
 from bodyslam_jax.evaluation.before_after import TruthBeside
 from bodyslam_jax.geometry.runs import runs
@@ -239,6 +241,15 @@ def _stick_figures(ax: Axes, result: Result, along: int) -> None:
                     linewidth=1.2,
                     alpha=0.45,
                 )
+            middle, radius = head_ball(result.joints[person, frame])
+            head = Circle(
+                (middle[along], middle[1]),
+                float(radius),
+                facecolor=person_color(person),
+                edgecolor="none",
+                alpha=0.45,
+            )
+            ax.add_patch(head)
 
 
 def _true_paths(ax: Axes, truth: TruthBeside | None, axes: tuple[int, int]) -> None:

@@ -105,7 +105,7 @@ def _status(status: str, along: float | None) -> str:
     """Returns the badge beside the title; `along` is the relative standard deviation of
     distances from the camera."""
     good = status == "ok"
-    text = "plausible" if good else html.escape(status)
+    text = html.escape(status)
     if good and along is not None and along > _MIN_SHOWN_DISTANCE_SIGMA:
         text += f", distances ± {100 * along:.0f} %"
     return f'<span class="badge {"good" if good else "bad"}">{text}</span>'

@@ -65,6 +65,7 @@ from bodyslam_jax.graph.pelvis_displacement import displacement as displacement
 from bodyslam_jax.graph.problem import VARIABLES as VARIABLES
 from bodyslam_jax.graph.problem import MotionPredictor as MotionPredictor
 from bodyslam_jax.graph.problem import Problem as Problem
+from bodyslam_jax.graph.problem import in_one_layout as in_one_layout
 from bodyslam_jax.graph.problem import layout_of as layout_of
 from bodyslam_jax.graph.problem import make_problem as make_problem
 from bodyslam_jax.graph.state import TURNS as TURNS

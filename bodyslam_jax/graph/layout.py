@@ -11,6 +11,8 @@ its own. Runs in NumPy when a problem is made.
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -82,6 +84,17 @@ class Layout(eqx.Module):
         return sum(b.landmark.size for b in self.buckets if b.lasting)
 
 
+class Tracks(NamedTuple):
+    """What a layout is made of: `m` observations of landmarks."""
+
+    num_frames: int
+    num_landmarks: int
+    frame: Int[np.ndarray, " m"]
+    landmark: Int[np.ndarray, " m"]
+    front: int
+    """As in `make_layout`."""
+
+
 def make_layout(
     num_frames: int,
     num_landmarks: int,
@@ -100,24 +113,33 @@ def make_layout(
     `front` is the number of chunks that a `MarginalPrior` couples, the first ones. With
     it the order is that of time, and no landmark is lasting.
     """
-    for size in sizes.SIZES if common_sizes else ():
-        given = size, num_frames, num_landmarks, frame, landmark, front
-        found = _in_size(*given)
+    if common_sizes:
+        tracks = Tracks(num_frames, num_landmarks, frame, landmark, front)
+        found = layouts_of_one_size([tracks])
         if found is not None:
-            return found
+            return found[0]
     given = num_frames, num_landmarks, frame, landmark, num_people, front
     return _of_own_size(*given)
 
 
-def _in_size(
-    size: sizes.Size,
-    num_frames: int,
-    num_landmarks: int,
-    frame: Int[np.ndarray, " m"],
-    landmark: Int[np.ndarray, " m"],
-    front: int,
-) -> Layout | None:
+def layouts_of_one_size(problems: Sequence[Tracks]) -> list[Layout] | None:
+    """Returns the layouts of problems in tables of the least common size that holds
+    each of them, so that all have equal shapes; `None` if there is none."""
+    for size in sizes.SIZES:
+        found = []
+        for tracks in problems:
+            layout = _in_size(size, tracks)
+            if layout is None:
+                break
+            found.append(layout)
+        else:
+            return found
+    return None
+
+
+def _in_size(size: sizes.Size, tracks: Tracks) -> Layout | None:
     """Returns the layout in tables of a given size; `None` if it does not fit."""
+    num_frames, num_landmarks, frame, landmark, front = tracks
     count = -(-num_frames // CHUNK)
     fits = (
         count <= size.chunks
@@ -141,8 +163,8 @@ def _in_size(
     if span.max() > size.widths[-1]:
         return None
     members = np.flatnonzero(span)
-    tracks = start[members], start[members] + span[members]
-    packed = _pack(*tracks, size.widths, size.chunks, size.groups)
+    ends = start[members], start[members] + span[members]
+    packed = _pack(*ends, size.widths, size.chunks, size.groups)
     if packed is None:
         return None
     rows = np.lexsort((frame, landmark))

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from bodyslam_jax.geometry.lengths import LENGTHS
 from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
 from bodyslam_jax.graph.factors.human_motion import HumanMotion
@@ -28,12 +29,18 @@ from bodyslam_jax.graph.globals import (
     split,
     vector_of,
 )
-from bodyslam_jax.graph.layout import Layout, make_layout
+from bodyslam_jax.graph.layout import (
+    Layout,
+    Tracks,
+    layouts_of_one_size,
+    make_layout,
+)
 from bodyslam_jax.graph.memory import check_memory
 from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.padding import Masked, check_padding, extend
-from bodyslam_jax.graph.sizes import is_dense
+from bodyslam_jax.graph.sizes import CHUNK_LANDMARKS, is_dense
 from bodyslam_jax.graph.state import TURNS, State, Step, gauge
+from bodyslam_jax.graph.terms import TermCosts, names_of_terms
 from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation import (
     Sizes,
@@ -115,25 +122,18 @@ class Problem(eqx.Module):
         costs = self.cost_by_term(state, held=held).values()
         return sum(costs, jnp.zeros_like(state.scale))
 
-    def cost_by_term(
-        self, state: State, *, held: bool = False
-    ) -> dict[str, Float[Array, ""]]:
-        """Returns the cost of each factor by its class's name; `held` as in `cost`."""
+    def cost_by_term(self, state: State, *, held: bool = False) -> TermCosts:
+        """Returns the cost of each term by its name (`graph/terms.py`); `held` as in
+        `cost`. The result is a `dict` that accepts names of factors' classes too."""
         problem = self if held else self.refresh(state)
         costs = [factor.cost(state) for factor in problem.factors]
-        return dict(zip(self.names, costs, strict=True))
+        return TermCosts(zip(self.names, costs, strict=True))
 
     @property
     def names(self) -> list[str]:
-        """Returns the names of the terms: the factors' classes, numbered from the
-        second factor of a class on."""
-        names: list[str] = []
-        for factor in self.factors:
-            inner = factor.factor if isinstance(factor, Masked) else factor
-            name = type(inner).__name__
-            taken = sum(other.split("_")[0] == name for other in names)
-            names.append(f"{name}_{taken + 1}" if taken else name)
-        return names
+        """Returns the name of each factor's term, as in `weights`: `human_motion`,
+        `keypoints`, numbered from the second term of a name on (`graph/terms.py`)."""
+        return names_of_terms(self.factors)
 
     def predict(self, state: State, *, frozen: bool = True) -> Any:
         """Returns the motion model's prediction at a state, `None` without a model.
@@ -386,6 +386,19 @@ def layout_of(
     **Raises:** `ValueError` for two `Reprojection` or `MarginalPrior`, and for priors
     of landmarks without an observation.
     """
+    frame, landmark, front = _tracks_of(factors)
+    for factor in factors:
+        if isinstance(factor, LandmarkPrior):
+            check_prior(factor, landmark)
+    if common_sizes is None:
+        common_sizes = not is_dense(sizes["t"], sizes["l"], sizes["h"])
+    given = sizes["t"], sizes["l"], frame, landmark, sizes["h"]
+    return make_layout(*given, common_sizes=common_sizes, front=front)
+
+
+def _tracks_of(factors: Sequence[Factor]) -> tuple[np.ndarray, np.ndarray, int]:
+    """Frame and landmark of each observation, and the number of chunks that a
+    `MarginalPrior` couples."""
     priors = [f for f in factors if isinstance(f, MarginalPrior)]
     if len(priors) > 1:
         raise ValueError(f"factors: {len(priors)} `MarginalPrior`, expected one.")
@@ -397,13 +410,32 @@ def layout_of(
         )
     frame = np.asarray(tracks[0].frame) if tracks else np.zeros(0, int)
     landmark = np.asarray(tracks[0].landmark) if tracks else np.zeros(0, int)
-    for factor in factors:
-        if isinstance(factor, LandmarkPrior):
-            check_prior(factor, landmark)
-    if common_sizes is None:
-        common_sizes = not is_dense(sizes["t"], sizes["l"], sizes["h"])
-    given = sizes["t"], sizes["l"], frame, landmark, sizes["h"]
-    return make_layout(*given, common_sizes=common_sizes, front=front)
+    return frame, landmark, front
+
+
+def in_one_layout(cases: Sequence[tuple[Problem, State]]) -> list[Problem]:
+    """The same problems with layouts of equal shapes, the least that holds them all.
+
+    **Raises:** `ValueError` if no common size holds each of them.
+    """
+    tracks = []
+    for problem, state in cases:
+        frame, landmark, front = _tracks_of(problem.factors)
+        size = len(state.cameras), len(state.landmarks)
+        tracks.append(Tracks(*size, frame, landmark, front))
+    layouts = layouts_of_one_size(tracks)
+    if layouts is None:
+        frames, landmarks = max(t[0] for t in tracks), max(t[1] for t in tracks)
+        raise ValueError(
+            f"cases: up to {frames} frames and {landmarks} landmarks, expected what "
+            f"fits one of the common sizes, of up to {LENGTHS[-1]} frames with "
+            f"{CHUNK_LANDMARKS} landmarks for each {CHUNK}; or tracks are too long for "
+            "it."
+        )
+    return [
+        dataclasses.replace(problem, layout=layout)
+        for (problem, _), layout in zip(cases, layouts, strict=True)
+    ]
 
 
 def _sample_state(free: Step) -> State:

@@ -5,7 +5,7 @@ deviation of each measurement instead, so `λ = σ⁻²`, averaged over the meas
 the term that are not missing.
 """
 
-import re
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -16,28 +16,20 @@ from jaxtyping import Array, Float
 from bodyslam_jax.graph.factor import Factor
 from bodyslam_jax.graph.padding import Masked
 from bodyslam_jax.graph.problem import Problem
+from bodyslam_jax.graph.terms import name_of_term
 from bodyslam_jax.graph.tracing import is_traced
-
-_TERM_NAMES = {
-    "Reprojection": "landmarks",
-    "KeypointReprojection": "keypoints",
-    "GroundContact": "ground",
-    "LandmarkPrior": "landmark_prior",
-}
-"""Names of terms that do not follow from the name of the factor's class."""
 
 
 def weights(problem: Problem) -> dict[str, Float[Array, ""]]:
     """Returns λ of each term, the mean inverse variance of its measurements.
 
-    Terms are named after the factor's class without `Prior`, in lower case:
-    `human_motion`, `body_pose`, `shape`, `stature`, ...; `landmarks` and `keypoints`
-    are the two reprojection terms. Units are those of σ⁻²: px⁻², rad⁻², m⁻² or leg
-    lengths⁻². A term whose measurements are all missing has 0; factors without a field
-    `sigma` or `whitening` have no λ here.
+    Terms have the names of `Problem.names`: `human_motion`, `body_pose`, `shape`,
+    `stature`, ...; `landmarks` and `keypoints` are the two reprojection terms. Units
+    are those of σ⁻²: px⁻², rad⁻², m⁻² or leg lengths⁻². A term whose measurements are
+    all missing has 0; factors without a field `sigma` or `whitening` have no λ here.
     """
     found = {}
-    for name, factor in zip(term_names(problem), problem.factors, strict=True):
+    for name, factor in zip(problem.names, problem.factors, strict=True):
         inner = factor.factor if isinstance(factor, Masked) else factor
         value = _mean_inverse_variance(inner)
         if value is not None:
@@ -58,27 +50,19 @@ def with_weights(
     **Raises:** `ValueError` for a term that the problem does not have, or a λ that is
     not positive and finite.
     """
-    names = term_names(problem)
+    names = problem.names
     factors = list(problem.factors)
-    for name, value in weights.items():
+    for given, value in weights.items():
+        name = given
+        if given not in names and (name := name_of_term(given)) in names:
+            text = f"with_weights({given}=...): the term is called {name!r}."
+            warnings.warn(text, DeprecationWarning, stacklevel=2)
         if name not in names:
             raise ValueError(f"weights: no term {name!r}, expected among {names}.")
         _check(name, value)
         i = names.index(name)
         factors[i] = _weighted(name, factors[i], value)
     return eqx.tree_at(lambda p: p.factors, problem, tuple(factors))
-
-
-def term_names(problem: Problem) -> list[str]:
-    """Returns the name of each factor's term, numbered where a class repeats."""
-    return [_snake_case(name) for name in problem.names]
-
-
-def _snake_case(name: str) -> str:
-    kind, _, number = name.partition("_")
-    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.removesuffix("Prior")).lower()
-    words = _TERM_NAMES.get(kind, words)
-    return f"{words}_{number}" if number else words
 
 
 def _mean_inverse_variance(factor: Factor) -> Float[Array, ""] | None:

@@ -8,21 +8,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bodyslam_jax.io.bodies.amass import write_body as write_body
+    from bodyslam_jax.io.bodies.formats.amass import write_body as write_body
     from bodyslam_jax.io.camera.tum import read_tum as read_tum
     from bodyslam_jax.io.camera.tum import write_tum as write_tum
     from bodyslam_jax.io.detected import with_detections as with_detections
-    from bodyslam_jax.io.keypoints.layouts import BODY25_FROM as BODY25_FROM
     from bodyslam_jax.io.sequence import read_sequence as read_sequence
     from bodyslam_jax.io.video import frames as frames
 
 _HOME = {
-    "BODY25_FROM": "keypoints.layouts",
     "frames": "video",
     "read_sequence": "sequence",
     "read_tum": "camera.tum",
     "with_detections": "detected",
-    "write_body": "bodies.amass",
+    "write_body": "bodies.formats.amass",
     "write_tum": "camera.tum",
 }
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]

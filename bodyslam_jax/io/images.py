@@ -81,7 +81,7 @@ def _is_whole_png(data: bytes) -> bool:
 
 def _header(file: Any) -> Any:
     """The image, of which Pillow has read no more than the header."""
-    from PIL import Image  # comes with matplotlib
+    from PIL import Image
 
     Image.init()
     return Image.open(file, formats=[name for name in _FORMATS if name in Image.OPEN])

@@ -22,10 +22,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from bodyslam_jax.body.skeleton import BODY25
 from bodyslam_jax.config import Detect
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io import BODY25_FROM, atomic
+from bodyslam_jax.io import atomic
 from bodyslam_jax.io.files import open_binary
+from bodyslam_jax.io.keypoints.layouts import from_layout, usual_layout
 from bodyslam_jax.people.networks import check_onnxruntime, make_session
 
 log = logging.getLogger(__name__)
@@ -241,11 +243,10 @@ def to_body25(points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "25 3"]:
     count = len(points)
     if count not in (17, 26, 133):
         raise InputError(f"pose: {count} keypoints, expected 17, 26 or 133.")
-    index = np.asarray(BODY25_FROM[count])
-    found = np.where((index >= 0)[:, None], points[index], 0.0)
-    for target, pair in ((1, (2, 5)), (8, (9, 12))):
-        found[target, :2] = found[pair, :2].mean(0)
-        found[target, 2] = found[pair, 2].min()
+    layout = usual_layout(count)
+    assert layout is not None
+    middles = (BODY25["neck"], BODY25["mid_hip"])
+    found = from_layout(points, [-1 if p in middles else p for p in layout.parts])
     found[found[:, 2] <= 0] = 0.0
     return found
 

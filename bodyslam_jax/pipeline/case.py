@@ -70,7 +70,15 @@ class Case:
 
         The function can be differentiated and mapped over states. People are present
         in the same frames as in the truth; the world is that of the map, in metres.
+        Frames beyond those of the truth, as `stack_cases` adds them, are left out.
         """
+        num_frames = self.truth.present.shape[1]
+        state = dataclasses.replace(
+            state,
+            cameras=state.cameras[:num_frames],
+            roots=state.roots[:, :num_frames],
+            poses=state.poses[:, :num_frames],
+        )
         return trajectories(
             state,
             self.body,

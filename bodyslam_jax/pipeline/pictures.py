@@ -8,7 +8,7 @@ import numpy as np
 from bodyslam_jax import io, sfm, view
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
-from bodyslam_jax.pipeline.progress import Stopwatch
+from bodyslam_jax.pipeline.progress import Stopwatch, counted
 from bodyslam_jax.types import Result, Sequence, SfmResult, Tracks
 
 _CODEC_BY_SUFFIX: dict[str, view.Codec] = {"webm": "VP8", "mp4": "H264"}
@@ -43,8 +43,10 @@ def write_pictures(
     number = len(cameras.landmarks)
     sampler = view.VideoSampler(sequence.num_frames, observations, number, middle)
     if sequence.frames is not None:
-        images = sampler.watch(_images(sequence, cameras))
-        with watch("overlay" if config.overlay else "images"):
+        stage = "overlay" if config.overlay else "images"
+        every = counted(_images(sequence, cameras), stage, sequence.num_frames)
+        images = sampler.watch(every)
+        with watch(stage):
             if config.overlay:
                 measured = config.overlay_measurements
                 view.write_overlay(

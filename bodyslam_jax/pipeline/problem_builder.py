@@ -1,6 +1,7 @@
 """`build`: makes the joint problem and its first state, without solving anything."""
 
 import dataclasses
+from collections.abc import Iterable
 
 from bodyslam_jax import diagnostics, graph, people
 from bodyslam_jax.body import load_body_model
@@ -10,6 +11,7 @@ from bodyslam_jax.pipeline import before_joint, find_people
 from bodyslam_jax.pipeline.case import Case
 from bodyslam_jax.pipeline.intrinsics import with_intrinsics
 from bodyslam_jax.pipeline.joint_problem import prepare
+from bodyslam_jax.solver.padding import stack
 from bodyslam_jax.types import Sequence
 
 
@@ -53,6 +55,33 @@ def build(
         sequence = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
     prepared = prepare(sequence, cameras, bodies, body, config, feet=False)
     return hold_groups(prepared.problem, hold), prepared.state
+
+
+def stack_cases(
+    cases: Iterable[Case | Sequence | tuple[graph.Problem, graph.State]],
+    config: Config | None = None,
+    hold: tuple[str, ...] = (),
+) -> tuple[graph.Problem, graph.State]:
+    """Several problems and first states as one of each, for `jax.vmap` and `jax.jit`.
+
+    Arrays get a leading axis of cases. Shorter cases get frames, landmarks and
+    observations that measure nothing and variables that may not move, up to the least
+    of the solver's common sizes that holds all; costs and solutions are those of each
+    alone, to rounding. States have the frames of that size: `Case.trajectories` leaves
+    out those that its case does not have.
+
+    Args:
+        cases: problems with their states, such as `build` gives; a `Case` or `Sequence`
+            is built here.
+        config, hold: of `build`, for those that are built here.
+
+    **Raises:** `ValueError` if the cases differ in their terms, number of people, free
+    groups of variables or settings, or fit no common size; and as `build`.
+    """
+    pairs = [
+        case if isinstance(case, tuple) else build(case, config, hold) for case in cases
+    ]
+    return stack(pairs)
 
 
 def hold_groups(problem: graph.Problem, hold: tuple[str, ...]) -> graph.Problem:

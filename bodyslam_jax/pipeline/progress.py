@@ -7,12 +7,20 @@ JSON without parsing messages.
 
 import contextlib
 import functools
+import importlib.metadata
+import json
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
 
 import jax
+
+from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io import atomic
+from bodyslam_jax.io.files import read_json
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +33,16 @@ _COMPILATION_EVENTS = (
 """JAX's monitoring events of lowering and of XLA (or of reading its cached result)."""
 _MIN_COMPILATION_S = 1.0
 """Time of compilation below which the log line of a stage does not mention it, s."""
+_TYPICAL_COMPILATION_S = {"people": 5.0, "joint": 26.0, "live": 60.0}
+"""Time that the programs of a stage take to compile on two cores, before this machine
+has been measured (`benchmarks/run.md`). That of `live`, which compiles the front end,
+the joint estimate and covariances, is about their sum."""
+_MIN_ANNOUNCED_COMPILATION_S = 4.0
+"""Time of compilation from which it is announced."""
+_TIMES_FILE = "compile_times.json"
+"""In the folder of compiled programs: seconds by stage, size and versions."""
+
+T = TypeVar("T")
 
 
 class Stopwatch:
@@ -78,6 +96,76 @@ class Counter:
         )
         self._last_update = now
         self._last_line = now if is_line else self._last_line
+
+
+def counted(items: Iterable[T], stage: str, total: int) -> Iterator[T]:
+    """The same items, of which there are `total`, with the progress of a `Counter`."""
+    counter = Counter(stage, total)
+    for k, item in enumerate(items):
+        yield item
+        counter(k + 1)
+
+
+@contextlib.contextmanager
+def compiling(stage: str, size: str) -> Iterator[None]:
+    """A block in which the programs of a stage are compiled, unless they have been.
+
+    Says before it how long that takes, once for a stage and `size` (the same for
+    problems that share programs) on a machine: about as long as for another size of the
+    stage, or as where this was measured. JAX's folder of compiled programs also has the
+    record of what they took; without such a folder a process says it once.
+    """
+    names = ("bodyslam-jax", "jax")
+    versions = ", ".join(f"{n} {importlib.metadata.version(n)}" for n in names)
+    key = f"{stage}: {size}; {jax.default_backend()}, {versions}"
+    known = _compile_times()
+    others = [s for name, s in known.items() if name.startswith(f"{stage}: ")]
+    seconds = max(others, default=0.0)
+    if seconds < _MIN_ANNOUNCED_COMPILATION_S:
+        seconds = _TYPICAL_COMPILATION_S[stage]
+    if key not in known and seconds >= _MIN_ANNOUNCED_COMPILATION_S:
+        once = ", once" if _programs() is not None else ""
+        log.info("%s: compiling, about %.0f s%s", stage, seconds, once)
+    clock = _compile_clock()
+    before = clock[0]
+    yield
+    if key not in known:
+        _remember(key, round(clock[0] - before, 1))
+
+
+_of_process: dict[str, float] = {}
+"""Compile times where no folder keeps programs."""
+
+
+def _programs() -> Path | None:
+    """JAX's folder of compiled programs, if there is one."""
+    options: Any = jax.config  # whose class declares no options
+    folder = options.jax_compilation_cache_dir
+    return Path(folder) if folder else None
+
+
+def _compile_times() -> dict[str, float]:
+    """Seconds by key of `compiling`; nothing where the record is damaged."""
+    folder = _programs()
+    if folder is None:
+        return _of_process
+    try:
+        found = read_json(folder / _TIMES_FILE)
+    except InputError:
+        return {}
+    items = found.items() if isinstance(found, dict) else ()
+    return {k: float(s) for k, s in items if isinstance(s, int | float)}
+
+
+def _remember(key: str, seconds: float) -> None:
+    folder = _programs()
+    if folder is None:
+        _of_process[key] = seconds
+        return
+    text = json.dumps(_compile_times() | {key: seconds}, indent=1)
+    with contextlib.suppress(OSError, InputError):  # It is for a message only.
+        folder.mkdir(parents=True, exist_ok=True)
+        atomic.write_text(folder / _TIMES_FILE, text + "\n")
 
 
 @functools.cache

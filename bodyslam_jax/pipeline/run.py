@@ -13,13 +13,14 @@ from bodyslam_jax.body import BodyModel, load_body_model, rest_joints
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.summary import summarise
+from bodyslam_jax.geometry.lengths import padded_length
 from bodyslam_jax.geometry.vertical_edges import Edges
 from bodyslam_jax.pipeline import joint_stage, people_stage, sfm_stage
 from bodyslam_jax.pipeline.default_body import with_compatible_body
 from bodyslam_jax.pipeline.intrinsics import with_intrinsics
 from bodyslam_jax.pipeline.own_terms import Factors, OwnTerms
 from bodyslam_jax.pipeline.people_stage import with_warnings
-from bodyslam_jax.pipeline.progress import Counter, Stopwatch
+from bodyslam_jax.pipeline.progress import Counter, Stopwatch, compiling
 from bodyslam_jax.pipeline.sfm_stage import find_edges
 from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.pipeline.to_metric import to_metric
@@ -91,13 +92,18 @@ def run_stages(
             edges = find_edges(everybody, cameras, cache=cache)
     with watch("joint"):
         given = refined, cameras, bodies, body, config, edges, own
-        compute = lambda: joint_stage.estimate(*given)
+
+        def compute() -> JointEstimate:
+            with compiling("joint", _size(refined)):
+                return joint_stage.estimate(*given)
+
         # The code of a user-defined factor has no fingerprint.
         joint = compute() if own else cache.stage("joint", key, JointEstimate, compute)
     if cameras.kind == "moving":
         with watch("edges"):
             edges = find_edges(everybody, cameras, joint, cache)
-    result = assemble(sequence, config, body, cameras, joint, watch.seconds, edges)
+    with watch("verdict"):
+        result = assemble(sequence, config, body, cameras, joint, watch.seconds, edges)
     return _with_shapes_of(files_body, body, result), cameras, refined
 
 
@@ -153,14 +159,23 @@ def before_joint(
     sequence = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
     model = body_model_file(config.body_model)
     key = fingerprint(sequence, config.people_fit, config.people, model)
+
+    def compute() -> Bodies:
+        with compiling("people", _size(sequence)):
+            return people_stage.estimate_bodies(sequence, body, config)
+
     with watch("people"):
-        bodies = cache.stage(
-            "people",
-            key,
-            Bodies,
-            lambda: people_stage.estimate_bodies(sequence, body, config),
-        )
+        bodies = cache.stage("people", key, Bodies, compute)
     return cameras, bodies
+
+
+def _size(sequence: Sequence) -> str:
+    """The sizes of arrays that decide which programs a sequence needs."""
+    keypoints, bodies = sequence.keypoints, sequence.bodies
+    number = 0 if keypoints is None else len(keypoints.uv)
+    if bodies is not None:
+        number = max(number, len(bodies.present))
+    return f"{padded_length(sequence.num_frames)} frames, {number} people"
 
 
 def assemble(

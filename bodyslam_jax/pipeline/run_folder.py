@@ -63,8 +63,9 @@ def run_in_locked_folder(
     with export.run_folder(out) as partial:
         still = write_pictures(partial, measured, cameras, result, body, config, watch)
         result.summary["durations_s"] |= watch.seconds
-        export.write_files(partial, result, config)
-        export.write_report(partial / "report.html", result, body, still, beside)
+        with watch("report"):
+            export.write_files(partial, result, config)
+            export.write_report(partial / "report.html", result, body, still, beside)
     return result
 
 

@@ -4,6 +4,7 @@ Padding has no effect: its measurements have `sigma = inf`, its variables are he
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -20,6 +21,7 @@ from bodyslam_jax.graph import (
     State,
     extend,
     extend_state,
+    in_one_layout,
     pad_factor,
 )
 
@@ -52,6 +54,65 @@ def pad(problem: Problem, state: State) -> tuple[Problem, State]:
         problem, factors=factors, free=free, motion=motion
     )
     return _typed((padded_problem, padded))
+
+
+def stack(cases: Sequence[tuple[Problem, State]]) -> tuple[Problem, State]:
+    """Problems and states of equal structure as one of each, with a leading axis.
+
+    All are padded to the frames, landmarks and observations of the least common size
+    (`graph/sizes.py`) that holds each of them.
+
+    **Raises:** `ValueError` that names the first case which differs from the one before
+    it, and in what, or if there is no case, or no common size.
+    """
+    if not cases:
+        raise ValueError("cases: found none, expected one or more.")
+    problems = in_one_layout(cases)
+    padded = []
+    for problem, (_, state) in zip(problems, cases, strict=True):
+        as_array = lambda x: _as_array(x, state.scale.dtype)
+        padded.append(jax.tree.map(as_array, pad(problem, state)))
+    for k in range(1, len(padded)):
+        if (what := _difference(padded[k - 1], padded[k])) is not None:
+            raise ValueError(f"cases: {k - 1} and {k} have {what}, expected the same.")
+    # On the host: nothing is compiled for a number of cases.
+    one = lambda *x: jnp.asarray(np.stack([np.asarray(each) for each in x]))
+    arrays = [eqx.filter(case, eqx.is_array) for case in padded]
+    _, static = eqx.partition(padded[0], eqx.is_array)
+    return eqx.combine(jax.tree.map(one, *arrays), static)
+
+
+def _as_array(leaf, dtype):
+    """Numbers that a factor was given as such, which `jax.vmap` would not map."""
+    return jnp.asarray(leaf, dtype) if isinstance(leaf, float) else leaf
+
+
+def _difference(first, second) -> str | None:
+    """What differs in the structure of two problems with their states, in words."""
+    (problem, state), (other, other_state) = first, second
+    pairs = {
+        "terms": (problem.names, other.names),
+        "people": (len(state.shapes), len(other_state.shapes)),
+        "variables": (problem.variables, other.variables),
+        "named globals": (problem.globals, other.globals),
+    }
+    for what, (a, b) in pairs.items():
+        if a != b:
+            return f"{what} {a} and {b}"
+    for factor, one in zip(problem.factors, other.factors, strict=True):
+        if jax.tree.structure(factor) != jax.tree.structure(one):
+            return f"a {type(factor).__name__} of different settings"
+    if jax.tree.structure(first) != jax.tree.structure(second):
+        return "different motion models or settings"
+    leaves = jax.tree_util.tree_leaves_with_path(first)
+    for (path, a), b in zip(leaves, jax.tree.leaves(second), strict=True):
+        if not eqx.is_array(a):
+            if a is not b and a != b:
+                return f"{jax.tree_util.keystr(path)} {a} and {b}"
+        elif (a.shape, a.dtype) != (b.shape, b.dtype):
+            shapes = f"{a.dtype}{a.shape} and {b.dtype}{b.shape}"
+            return f"{jax.tree_util.keystr(path)} of {shapes}"
+    return None
 
 
 def _typed(tree):

@@ -5,20 +5,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.types import Keypoints, Result, Tracks
 from bodyslam_jax.view.ground import Ground
+from bodyslam_jax.view.insets import Insets
 from bodyslam_jax.view.keypoint_marks import KeypointMarks
 from bodyslam_jax.view.people import Mesh, coarse_body, draw_people, meshes
 from bodyslam_jax.view.person_style import Legend, person_styles, write_names
-from bodyslam_jax.view.side_view import SideView
 from bodyslam_jax.view.style import Image, write_text
-from bodyslam_jax.view.top_view import Plan, draw_trails, trails
+from bodyslam_jax.view.top_view import draw_trails, trails
 from bodyslam_jax.view.video_file import Codec, write_video
-
-_MARGIN = 10
-"""px, from the insets to the picture's edges."""
 
 
 def write_overlay(
@@ -40,7 +38,8 @@ def write_overlay(
         intrinsics; frames that are missing are drawn on black.
     - `tracks`: points to draw; `size`: width and height (px) where there are no frames,
         else twice the principal point.
-    - `max_width`: larger frames are drawn smaller, px.
+    - `max_width`: larger frames are drawn smaller, px. Where people come into every
+        corner, the insets are beside the image, and the video is wider than it.
     - `codec`: VP8 by default (`.webm`), which plays in the same browsers as VP9 and is
         three times as fast, as OpenCV cannot set the speed of its VP9 encoder; `H264`
         (`.mp4`) needs PyAV.
@@ -56,12 +55,24 @@ def write_overlay(
     elif size is None:
         cx, cy = result.intrinsics[2:4]
         size = (round(2 * cx) + 1, round(2 * cy) + 1)
-    width = max(2, min(size[0], max_width) // 2 * 2)
+    shown, zoom = _shown(size, min(size[0], max_width))
+    insets = Insets(result, shown, zoom)
+    while (wide := shown[0] + insets.column) > max_width and shown[0] > 2:
+        shown, zoom = _shown(size, shown[0] * max_width // wide)
+        insets = Insets(result, shown, zoom, beside=True)
+    images = _images(first, source, len(result.timestamps), shown)
+    drawn = pictures(images, result, body, tracks, zoom, insets, keypoints)
+    write_video(path, drawn, (shown[0] + insets.column, shown[1]), result.fps, codec)
+
+
+def _shown(
+    size: tuple[int, int], width: int
+) -> tuple[tuple[int, int], Float[np.ndarray, " 2"]]:
+    """The size (px, even) of images of `size` that are shown `width` wide, and their
+    pixels per pixel of the image."""
+    width = max(2, width // 2 * 2)
     height = max(2, round(size[1] * width / size[0] / 2) * 2)
-    zoom = np.array([width / size[0], height / size[1]])
-    images = _images(first, source, len(result.timestamps), (width, height))
-    drawn = pictures(images, result, body, tracks, (width, height), zoom, keypoints)
-    write_video(path, drawn, (width, height), result.fps, codec)
+    return (width, height), np.array([width / size[0], height / size[1]])
 
 
 def _images(
@@ -84,18 +95,17 @@ def pictures(
     result: Result,
     body: BodyModel,
     tracks: Tracks | None,
-    size: tuple[int, int],
     zoom: np.ndarray,
+    insets: Insets,
     keypoints: Keypoints | None = None,
 ) -> Iterator[Image]:
-    """The pictures of the overlay; `images` have their size, one for each frame."""
+    """The pictures of the overlay; `images` have the size that `insets` were made for,
+    one for each frame."""
     coarse = coarse_body(body)
     faces = np.asarray(coarse.faces)
     num_frames = len(result.timestamps)
     lines = trails(tracks, num_frames, zoom)
-    ground, plan = Ground(result, zoom), Plan(result, size)
-    side = SideView(result, plan.side)
-    left = size[0] - _MARGIN - plan.side
+    ground = Ground(result, zoom)
     styles = person_styles(result)
     legend = Legend(result, styles)
     named = len(styles) > 1 or any(style.words for style in styles)
@@ -112,11 +122,11 @@ def pictures(
             write_names(picture, [(name, at) for name, at in heads if at is not None])
         if marks is not None:
             marks.draw(picture, frame)
-        plan.draw(picture, frame, (left, _MARGIN))
-        side.draw(picture, frame, (left, _MARGIN + plan.side + 4))
+        picture = insets.draw(picture, frame)
+        low = len(picture)
         text = f"frame {frame + 1}/{num_frames}  {result.timestamps[frame]:.2f} s"
-        write_text(picture, text, (10, size[1] - 12))
-        legend.draw(picture, (10, size[1] - 34))
+        write_text(picture, text, (10, low - 12))
+        legend.draw(picture, (10, low - 34))
         yield picture
 
 

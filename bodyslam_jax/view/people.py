@@ -1,8 +1,9 @@
 """Bodies on an image, by the painter's algorithm on a decimated mesh.
 
 Triangles are drawn farthest first; those that reach behind the camera are left out.
-Who is doubtful or not measurable is paler and has a dashed or dotted outline; limbs
-that were inferred are pale.
+Bodies are transparent with an outline, so that the person in the image shows beside
+the body that misses them. Who is doubtful or not measurable is paler and has a dashed
+or dotted outline; limbs that were inferred are pale.
 """
 
 import dataclasses
@@ -27,6 +28,10 @@ _NEAR = 0.05
 """Triangles nearer to the camera's plane than this are not drawn, m."""
 _STILL = 960
 """Greatest width of a still, px."""
+_SPECK = 12
+"""Length of a contour, px, below which it is that of a gap between triangles."""
+_LARGE = 150
+"""Height of a person, px, below which a line of 2 px would cover the arms."""
 _CHUNK = 16
 """Frames whose meshes are computed together."""
 
@@ -199,34 +204,34 @@ def draw_people(
     # Sixteenths of a pixel; far-off corners must not overflow in OpenCV.
     triangles = np.round(np.clip(triangles, -4000, 4000) * 16).astype(np.int32)
     shades = np.concatenate(colors)[order].astype(int).tolist()
-    drawn = image.copy()
-    for triangle, shade in zip(triangles, shades, strict=True):
-        cv2.fillConvexPoly(drawn, triangle, shade, cv2.LINE_8, 4)
-    here = sorted({mesh.person for mesh in people})
-    if all(styles[h].dash is None for h in here):
-        opacity = styles[here[0]].opacity
-        return cv2.addWeighted(drawn, opacity, image, 1 - opacity, 0)
-    owner = np.zeros((height, width), np.uint8)
-    number = {h: k + 1 for k, h in enumerate(here[:255])}
-    for triangle, h in zip(triangles, np.concatenate(owners)[order], strict=True):
-        cv2.fillConvexPoly(owner, triangle, number.get(int(h), 0), cv2.LINE_8, 4)
-    opacities = np.array([0.0, *(styles[h].opacity for h in number)])
-    share = opacities[owner][..., None]
-    blended = np.round(share * drawn + (1 - share) * image).astype(np.uint8)
-    for h, k in number.items():
-        _outline(blended, (owner == k).astype(np.uint8), styles[h])
+    here = sorted({mesh.person for mesh in people})[:255]
+    number = {h: k + 1 for k, h in enumerate(here)}
+    owner = [number.get(int(h), 0) for h in np.concatenate(owners)[order]]
+    # The fourth channel has who is in front.
+    drawn = cv2.merge([image, np.zeros((height, width), np.uint8)])
+    for triangle, shade, k in zip(triangles, shades, owner, strict=True):
+        cv2.fillConvexPoly(drawn, triangle, (*shade, k), cv2.LINE_8, 4)
+    front = np.asarray(drawn[..., 3], np.uint8)
+    opacities = np.array([0.0, *(styles[h].opacity for h in here)], np.float32)
+    share = opacities[front][..., None]
+    blended = np.round(share * drawn[..., :3] + (1 - share) * image).astype(np.uint8)
+    # Who is in front has a whole outline.
+    for mesh in sorted(people, key=lambda mesh: -float(mesh.p_C[:, 2].mean())):
+        if (k := number.get(mesh.person)) is not None:
+            _outline(blended, (front == k).astype(np.uint8), styles[mesh.person])
     return blended
 
 
 def _outline(image: Image, mask: UInt8[np.ndarray, "y x"], style: PersonStyle) -> None:
-    """Dashes around a person who is not `ok`."""
-    if style.dash is None:
-        return
+    """A line around a person; in dashes around one who is not `ok`."""
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for contour in contours:
-        curve = 16 * contour[:, 0].astype(int)
-        polylines(image, curve, (20, 20, 20), 3, style.dash)
-        polylines(image, curve, style.color, 2, style.dash)
+        if len(contour) < _SPECK:
+            continue
+        curve = 16 * np.concatenate([contour, contour[:1]])[:, 0].astype(int)
+        width = 2 if np.ptp(contour[..., 1]) >= _LARGE else 1
+        polylines(image, curve, (20, 20, 20), width + 1, style.dash)
+        polylines(image, curve, style.color, width, style.dash)
 
 
 _LIGHT = np.array([-0.5, -0.62, -0.6])

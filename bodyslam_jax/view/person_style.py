@@ -28,23 +28,23 @@ class PersonStyle:
     white: float
     """Share of white in the colour of the body."""
     opacity: float
-    """Of the body over the image."""
+    """Of the body over the image: the person must show through, or a misfit would
+    not."""
     dash: tuple[int, int] | None
-    """px drawn and px left out of the outline and of paths; `None`: no outline, and
-    paths in one line."""
+    """px drawn and px left out of the outline and of paths; `None`: in one line."""
 
     @property
     def faint(self) -> Color:
         """The colour on the dark insets, where no body is drawn."""
-        share = 1.0 if self.dash is None else 0.8 if self.opacity > 0.5 else 0.55
+        share = 1.0 if self.dash is None else 0.8 if self.opacity > 0.3 else 0.55
         b, g, r = (int(share * c + (1 - share) * 60) for c in self.color)
         return b, g, r
 
 
 _BY_STATUS = {
-    "ok": (0.4, 0.72, None),
-    "doubtful": (0.6, 0.6, (9, 6)),
-    "not_measurable": (0.75, 0.3, (2, 5)),
+    "ok": (0.25, 0.5, None),
+    "doubtful": (0.6, 0.4, (9, 6)),
+    "not_measurable": (0.75, 0.2, (2, 5)),
 }
 
 

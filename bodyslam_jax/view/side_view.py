@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
+from bodyslam_jax.body.skeleton import head_ball
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.person_style import person_styles
 from bodyslam_jax.view.style import CAMERA, Image, blend_inset, polylines
@@ -26,7 +27,8 @@ class SideView:
         self.result, self.width = result, width
         self.styles = person_styles(result)
         places = [result.T_WC[result.located, :3, 3]]
-        places.append(result.joints[result.present].reshape(-1, 3))
+        joints = result.joints[result.present]
+        places.append(joints.reshape(-1, 3))
         every = np.concatenate(places)
         level = every[:, [0, 2]] - every[:, [0, 2]].mean(axis=0)
         self.along = np.zeros(3)
@@ -42,7 +44,9 @@ class SideView:
         self.moves = extent > _WIDEST
         self.zoom = width / min(extent, _WIDEST)
         self.low = min(0.0, float(every[:, 1].min()))
-        high = max(2.1, float(every[:, 1].max()) + 0.15)
+        middle, radius = head_ball(joints)
+        top = np.append(every[:, 1], middle[:, 1] + radius).max()
+        high = max(2.1, float(top) + 0.05)
         self.height = int(np.clip(self.zoom * (high - self.low) + 8, 24, width))
 
     def draw(self, image: Image, frame: int, corner: tuple[int, int]) -> None:
@@ -68,6 +72,10 @@ class SideView:
             style = self.styles[h]
             for limb in limbs:
                 polylines(inset, limb, style.faint, 2, style.dash and (4, 4))
+            middle, radius = head_ball(r.joints[h, frame])
+            round_head = 16 * max(round(float(radius) * self.zoom), 2)
+            place = at(middle[None])[0].tolist()
+            cv2.circle(inset, place, round_head, style.faint, -1, cv2.LINE_AA, 4)
         if r.located[frame]:
             right, down, ahead = r.T_WC[frame, :3, :3].T
             size = 14 / self.zoom

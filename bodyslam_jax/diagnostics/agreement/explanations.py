@@ -145,7 +145,7 @@ def _other_bodies(people: People, ratios: list[float]) -> Iterator[Explanation]:
     for R in _axes():
         yield Explanation("axes", turned(R), R=R, name=_axes_name(R))
     longer = max(camera.width, camera.height)
-    # Default focal lengths of tools (`io.bodies.tool_focal`), and SPIN's.
+    # Default focal lengths of tools of `io.bodies.formats`, and SPIN's.
     usual = np.array(
         [np.hypot(camera.width, camera.height), 5000 / 256 * longer, 5000.0]
     )

@@ -1,12 +1,10 @@
 """Regressed bodies of any tool -> one checked `Bodies`.
 
-`bodies.npz`, the format of this package, is read here, result files of other tools by
-`tools`.
+The formats are in `formats`, `bodies.npz`, that of this package, among them.
 """
 
 import dataclasses
 import logging
-import re
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +13,12 @@ from jaxtyping import Float
 
 from bodyslam_jax.config import Association
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io.bodies.amass import body_pose, is_smplx
+from bodyslam_jax.io.bodies.body_format import body_formats
 from bodyslam_jax.io.bodies.body_records import Rows, Video
-from bodyslam_jax.io.bodies.parts import (
-    PELVIS_SMPL,
-    PELVIS_SMPLX,
-    genders_in,
-    join,
-    numbers_of,
-    whole_of,
-)
-from bodyslam_jax.io.bodies.slahmr import with_track_info
-from bodyslam_jax.io.bodies.tools import READERS, from_spin
+from bodyslam_jax.io.bodies.parts import genders_in
 from bodyslam_jax.io.budget import check_bytes, last_frame_problem
-from bodyslam_jax.io.frame_index import InvalidContent, Warn
+from bodyslam_jax.io.formats import attributed, format_of, names_of
+from bodyslam_jax.io.frame_index import Warn
 from bodyslam_jax.io.safe_pickle import restricted_load
 from bodyslam_jax.types import Bodies, Intrinsics
 
@@ -53,10 +43,8 @@ def read_bodies(
     config: Association = Association(),
     warn: Warn = _log.warning,
 ) -> Bodies:
-    """Reads regressed bodies, recognised by content; or a folder of TRAM's tracks.
+    """Reads a file or folder of any format in `body_formats`, recognised by content.
 
-    Shapes in `bodies.npz` count as regressed by a network, unless its array
-    `shapes_regressed` () is false, for shapes that were measured or optimised.
     Pickles are read by `safe_pickle`, which runs nothing in them.
 
     Args:
@@ -71,13 +59,28 @@ def read_bodies(
     if not path.exists():
         raise InputError(f"{path}: no such file.")
     video = Video(intrinsics, num_frames, fps, times, images, config, warn)
-    if path.is_dir():
-        rows, gender = _read_tram_folder(path, video), None
-    else:
-        data = restricted_load(path)
-        gender = _gender(data, warn)
-        rows = _read(path, with_track_info(path, data), video)
+    among = body_formats()
+    chosen, source = format_of(path, among, _arrays)
+    if chosen is None:
+        keys = ", ".join(str(k) for k in list(source.content)[:6])
+        raise InputError(f"{path}: not bodies of {names_of(among)}; it holds {keys}.")
+    with attributed(path, "bodies"):
+        rows = chosen.read(source, video)
+    gender = _gender(source.content, warn)
     return dataclasses.replace(_gather(path, rows, num_frames, warn), gender=gender)
+
+
+def _arrays(path: Path) -> dict:
+    """The named arrays of a file.
+
+    **Raises:** `InputError`, naming the file, if it has none.
+    """
+    data = restricted_load(path)
+    if isinstance(data, dict) and set(data) == {"results"}:
+        data = data["results"]
+    if not isinstance(data, dict) or not data:
+        raise InputError(f"{path}: no named arrays in it, so not bodies.")
+    return data
 
 
 def _gender(data: Any, warn: Warn) -> str | None:
@@ -93,109 +96,6 @@ def _gender(data: Any, warn: Warn) -> str | None:
             "all, in which β of the others mean other shapes."
         )
     return known.pop() if len(known) == 1 else None
-
-
-def _read(path: Path, data: Any, video: Video) -> Rows:
-    if isinstance(data, dict) and set(data) == {"results"}:
-        data = data["results"]
-    if not isinstance(data, dict) or not data:
-        raise InputError(f"{path}: no named arrays in it, so not bodies.")
-    try:
-        if {"frame", "poses", "betas"} <= set(data):
-            return _from_contract(data, video)
-        for _, recognise, read in READERS:
-            if recognise(data):
-                return read(data, video)
-    except InvalidContent as error:
-        raise InputError(f"{path}: {error}.") from None
-    except InputError:
-        raise
-    except Exception as error:
-        # Dictionaries of other tools, nested in any way: whatever fails is theirs.
-        what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
-        raise InputError(f"{path}: incomplete or damaged bodies ({what}).") from None
-    supported = ", ".join(dict.fromkeys(name for name, _, _ in READERS))
-    keys = ", ".join(str(k) for k in list(data)[:6])
-    raise InputError(
-        f"{path}: not bodies of {supported} or bodies.npz; it holds {keys}."
-    )
-
-
-def _from_contract(data: dict, video: Video) -> Rows:
-    regressed = _flag(data, "shapes_regressed", default=True)
-    if "trans" not in data:
-        if "camera" not in data:
-            raise InvalidContent("neither `trans` nor `camera` and `bbox`")
-        rows = from_spin({**data, "pose": data["poses"]}, video)
-        return dataclasses.replace(rows, shapes_regressed=regressed)
-    arrays = {}
-    n = numbers_of(data, "frame", None).size
-    data = _as_smpl(data)
-    person = data.get("person", np.zeros(n))
-    for name, value, shape in (
-        ("frame", data["frame"], (n,)),
-        ("person", person, (n,)),
-        ("poses", data["poses"], (n, 72)),
-        ("betas", data["betas"], (n, 10)),
-        ("trans", data["trans"], (n, 3)),
-    ):
-        array = numbers_of({name: value}, name, shape)
-        whole = name in ("frame", "person")
-        arrays[name] = whole_of(array, name) if whole else array
-    return Rows(**arrays, shapes_regressed=regressed)
-
-
-def _as_smpl(data: dict) -> dict:
-    """The data with SMPL's poses, if they are as wide as SMPL-H's or SMPL-X's."""
-    poses, betas = (numbers_of(data, name, None) for name in ("poses", "betas"))
-    if poses.ndim != 2 or poses.shape[1] not in (66, 156, 165):
-        poses72 = poses
-    else:
-        poses72 = body_pose(poses)
-        if is_smplx(data, poses.shape[1]):
-            trans = numbers_of(data, "trans", (-1, 3)) + PELVIS_SMPLX - PELVIS_SMPL
-            return {
-                **data,
-                "poses": poses72,
-                "trans": trans,
-                "betas": 0 * betas[:, :10],
-            }
-    if betas.ndim == 2 and betas.shape[1] > 10:
-        betas = betas[:, :10]
-    return {**data, "poses": poses72, "betas": betas}
-
-
-def _flag(data: dict, key: str, default: bool) -> bool:
-    value = np.asarray(data.get(key, default))
-    if value.size != 1 or value.item() not in (0, 1):
-        raise InvalidContent(f"`{key}` is {str(value)[:40]}, not true or false")
-    return bool(value.item())
-
-
-def _read_tram_folder(folder: Path, video: Video) -> Rows:
-    """TRAM's `hps/` (one file per person), with `camera.npy` beside or above it."""
-    tracks = sorted(folder.glob("**/hps_track_*.npy"))
-    if not tracks:
-        raise InputError(f"{folder}: a folder without TRAM's hps_track_*.npy.")
-    cameras = [p / "camera.npy" for p in (folder, tracks[0].parent, folder.parent)]
-    camera_file = next((p for p in cameras if p.is_file()), None)
-    camera = restricted_load(camera_file) if camera_file else {}
-    if not isinstance(camera, dict):
-        raise InputError(f"{camera_file}: not a dictionary, expected TRAM's camera.")
-    shared = {k: camera[k] for k in ("img_focal", "img_center") if k in camera}
-    rows = []
-    for track in tracks:
-        data = restricted_load(track)
-        if not isinstance(data, dict):
-            raise InputError(f"{track}: not a dictionary of arrays.")
-        one = _read(track, {**data, **shared}, video)
-        digits = re.findall(r"\d{1,9}", track.stem)
-        if not digits:
-            raise InputError(f"{track}: no number of a person in its name.")
-        number = int(digits[-1])
-        person = np.full(len(one.frame), number)
-        rows.append(Rows(one.frame, person, one.poses, one.betas, one.trans))
-    return join(rows)
 
 
 def _finite(path: Path, rows: Rows, warn: Warn) -> Rows:

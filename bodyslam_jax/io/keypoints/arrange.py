@@ -11,9 +11,9 @@ from jaxtyping import Float
 from bodyslam_jax.body.skeleton import BODY25_FACE
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.frame_index import Warn
-from bodyslam_jax.io.keypoints.files import Listed
+from bodyslam_jax.io.keypoints.keypoint_format import Listed
 from bodyslam_jax.io.keypoints.layout_evidence import choose_layout
-from bodyslam_jax.io.keypoints.layouts import LAYOUTS, VITPOSE, from_layout, to_body25
+from bodyslam_jax.io.keypoints.layouts import LAYOUTS, VITPOSE, from_layout
 from bodyslam_jax.io.keypoints.lying import lying
 from bodyslam_jax.io.keypoints.names import layout_of
 
@@ -101,9 +101,14 @@ def _in_order(
                 f"{path}: names of {len(layout)} keypoints, but {num} a person."
             )
         return from_layout(points, layout), layout
-    layouts = LAYOUTS.get(num)
-    if layouts is None:
-        return to_body25(path, points), list(range(25))
+    if num not in LAYOUTS:
+        *others, last = LAYOUTS
+        expected = f"{', '.join(map(str, others))} or {last}"
+        raise InputError(f"{path}: {num} keypoints a person, not {expected}.")
+    layouts = {name: layout.parts for name, layout in LAYOUTS[num].items()}
+    if len(layouts) == 1:
+        [only] = layouts.values()
+        return from_layout(points, only), only
     choice = choose_layout(points, layouts)
     usual = next(iter(layouts))
     if not choice.plausible:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body.skeleton import BODY25
+from bodyslam_jax.io.keypoints.layouts import usual_layout
 
 UNKNOWN = "unknown"
 _BY_WORD = {
@@ -21,7 +22,6 @@ _BY_WORD = {
     "coco|movenet|vitpose|rtmpose|dwpose|hrnet|rtmo|yolo|wholebody": "coco",
     "smpl|joints|simulat": UNKNOWN,
 }
-_BY_COUNT = {17: "coco", 18: "openpose", 133: "coco", 26: "halpe", 136: "halpe"}
 _EXACT = 0.02
 """px, to which written midpoints are the middle of two written points."""
 _DETECTORS_NECK = 0.06
@@ -51,8 +51,9 @@ def definition_of(
         for pattern, definition in _BY_WORD.items():
             if re.search(pattern, words):
                 return definition
-    if count in _BY_COUNT:
-        return _BY_COUNT[count]
+    usual = usual_layout(count)
+    if usual is not None and usual.definition is not None:
+        return usual.definition
     needed = [_NECK, _MID_HIP, *_SHOULDERS, *_HIPS]
     points = points[(points[:, needed, 2] > 0).all(axis=1)]
     if count != 25 or len(points) < _FEWEST:

@@ -11,15 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io.archive import Archive
 from bodyslam_jax.io.budget import MAX_PEOPLE
 from bodyslam_jax.io.declared_size import Size, factor_to, scaled
+from bodyslam_jax.io.formats import attributed, format_of, names_of
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.keypoints.arrange import arranged
 from bodyslam_jax.io.keypoints.detector import UNKNOWN, definition_of
-from bodyslam_jax.io.keypoints.files import (
-    read_json_keypoints,
-    read_npz_keypoints,
-    read_openpose,
+from bodyslam_jax.io.keypoints.keypoint_format import (
+    Listed,
+    keypoint_formats,
+    parsed,
 )
 from bodyslam_jax.io.keypoints.turned import turned_back
 
@@ -54,8 +56,8 @@ def read_detections(
     images: tuple[str, ...] = (),
     warn: Warn = _log.warning,
 ) -> Detected:
-    """Reads whatever `path` is: a folder of OpenPose JSON files, a JSON file of
-    AlphaPose, MMPose, COCO or easy_ViTPose, or a generic `.npz`.
+    """Reads a file or folder of any format in `keypoint_formats`, recognised by
+    content: OpenPose's, AlphaPose's, COCO's, MMPose's, easy_ViTPose's, or arrays.
 
     Points that are not finite are missing; points in another order than usual, in
     (y, x), or in images of another declared size are converted, with warnings.
@@ -69,13 +71,9 @@ def read_detections(
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder.")
-    if path.is_dir():
-        listed = read_openpose(path)
-    elif path.suffix.lower() == ".npz":
-        listed = read_npz_keypoints(path, num_frames)
+    listed = _listed(path, num_frames)
+    if path.suffix.lower() == ".npz":
         images = ()  # its frames are rows, not names
-    else:
-        listed = read_json_keypoints(path)
     try:
         frames = frames_of_names(
             listed.names,
@@ -108,6 +106,25 @@ def read_detections(
     every = np.concatenate([np.zeros((0, 25, 3)), *found.points])
     definition = definition_of(every, count, listed.detector)
     return dataclasses.replace(found, definition=definition)
+
+
+def _listed(path: Path, num_frames: int | None) -> Listed:
+    """The content of the file or folder, as its format reads it."""
+    among = keypoint_formats()
+    chosen, source = format_of(path, among, parsed)
+    if chosen is not None:
+        with attributed(path, f"keypoints of {chosen.name}"):
+            listed = chosen.read(source, num_frames)
+        if listed.parts is None and chosen.layout is not None:
+            listed = dataclasses.replace(listed, parts=chosen.layout)
+        return listed
+    data = source.content
+    if isinstance(data, Archive):
+        found = ", ".join(data.names[:12])
+        raise InputError(f"{path}: no array `keypoints`, only {found}.")
+    what = list(data)[:5] if isinstance(data, dict) else type(data).__name__
+    expected = names_of([f for f in among if not f.folder])
+    raise InputError(f"{path}: not keypoints of {expected}, but {what}.")
 
 
 def _checked(person: list[np.ndarray], warn: Warn) -> list[np.ndarray] | None:

@@ -7,8 +7,10 @@ from jaxtyping import Float
 
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.atomic import write_npz
+from bodyslam_jax.io.bodies.body_format import BodyFormat
 from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import PELVIS_SMPL, PELVIS_SMPLX, numbers_of
+from bodyslam_jax.io.formats import Source
 from bodyslam_jax.io.frame_index import InvalidContent
 
 _RATES = ("mocap_framerate", "mocap_frame_rate")
@@ -22,20 +24,7 @@ _MAX_RATIO = 2.5
 together."""
 
 
-def is_amass(data: dict) -> bool:
-    """Whether these are AMASS' arrays, of any of its releases."""
-    rate = any(key in data for key in _RATES)
-    whole = "poses" in data or {"root_orient", "pose_body"} <= set(data)
-    return rate and whole and {"trans", "betas"} <= set(data)
-
-
-def is_smplx(data: dict, width: int) -> bool:
-    """Whether the poses are SMPL-X's, by their width or by `surface_model_type`."""
-    named = str(np.asarray(data.get("surface_model_type", "")).reshape(-1)[:1])
-    return width == _SMPLX or "smplx" in named
-
-
-def from_amass(data: dict, video: Video) -> Rows:
+class Amass(BodyFormat):
     """AMASS style: the motion of one person, taken to be in the camera frame.
 
     Poses of SMPL (t, 72), SMPL-H (t, 156) or SMPL-X (t, 165), whose first 22 joints are
@@ -43,39 +32,59 @@ def from_amass(data: dict, video: Video) -> Rows:
     left out. Motion and video begin together; another frame rate is resampled to the
     times of the video's frames.
     """
-    if "poses" in data:
-        poses = numbers_of(data, "poses", None)
-    else:
-        parts = (numbers_of(data, k, None) for k in ("root_orient", "pose_body"))
-        poses = np.concatenate([p.reshape(len(p), -1) for p in parts], axis=-1)
-    n = len(poses)
-    if poses.ndim != 2 or poses.shape[1] < 66 or not n:
-        raise InvalidContent(
-            f"`poses` is {poses.shape}, not (t, 72), (t, 156) or (t, 165)"
+
+    name = "AMASS"
+    layout = ("trans", "betas")
+
+    def recognises(self, source: Source) -> bool:
+        """Whether these are AMASS' arrays, of any of its releases."""
+        if not super().recognises(source):
+            return False
+        names = set(source.content)
+        whole = "poses" in names or {"root_orient", "pose_body"} <= names
+        return whole and "frame" not in names and bool(names & set(_RATES))
+
+    def read(self, source: Source, video: Video) -> Rows:
+        data = source.content
+        if "poses" in data:
+            poses = numbers_of(data, "poses", None)
+        else:
+            parts = (numbers_of(data, k, None) for k in ("root_orient", "pose_body"))
+            poses = np.concatenate([p.reshape(len(p), -1) for p in parts], axis=-1)
+        n = len(poses)
+        if poses.ndim != 2 or poses.shape[1] < 66 or not n:
+            raise InvalidContent(
+                f"`poses` is {poses.shape}, not (t, 72), (t, 156) or (t, 165)"
+            )
+        smplx = is_smplx(data, poses.shape[1])
+        poses, trans = body_pose(poses), numbers_of(data, "trans", (n, 3))
+        if smplx:
+            trans = trans + PELVIS_SMPLX - PELVIS_SMPL
+        key = next(key for key in _RATES if key in data)
+        rate = np.ravel(numbers_of(data, key, None))
+        if len(rate) != 1 or not 0 < rate[0] < np.inf:
+            raise InvalidContent(f"`{key}` is {rate.tolist()}, not a rate in 1/s")
+        at, slack = _positions(n, float(rate[0]), video)
+        video.warn("AMASS-style bodies taken as in the camera's frame, not in a world.")
+        frame = np.flatnonzero(at <= n - 1 + slack)
+        at = np.minimum(at[frame], n - 1)
+        poses, trans = _between(poses, trans, at)
+        betas = np.ravel(numbers_of(data, "betas", None))[: 0 if smplx else 10]
+        betas = np.pad(betas, (0, 10 - len(betas)))
+        return Rows(
+            frame,
+            np.zeros(len(frame), np.int64),
+            poses,
+            np.tile(betas, (len(frame), 1)),
+            trans,
+            shapes_regressed=smplx,
         )
-    smplx = is_smplx(data, poses.shape[1])
-    poses, trans = body_pose(poses), numbers_of(data, "trans", (n, 3))
-    if smplx:
-        trans = trans + PELVIS_SMPLX - PELVIS_SMPL
-    key = next(key for key in _RATES if key in data)
-    rate = np.ravel(numbers_of(data, key, None))
-    if len(rate) != 1 or not 0 < rate[0] < np.inf:
-        raise InvalidContent(f"`{key}` is {rate.tolist()}, not a rate in 1/s")
-    at, slack = _positions(n, float(rate[0]), video)
-    video.warn("AMASS-style bodies taken as in the camera's frame, not in a world.")
-    frame = np.flatnonzero(at <= n - 1 + slack)
-    at = np.minimum(at[frame], n - 1)
-    poses, trans = _between(poses, trans, at)
-    betas = np.ravel(numbers_of(data, "betas", None))[: 0 if smplx else 10]
-    betas = np.pad(betas, (0, 10 - len(betas)))
-    return Rows(
-        frame,
-        np.zeros(len(frame), np.int64),
-        poses,
-        np.tile(betas, (len(frame), 1)),
-        trans,
-        shapes_regressed=smplx,
-    )
+
+
+def is_smplx(data: dict, width: int) -> bool:
+    """Whether the poses are SMPL-X's, by their width or by `surface_model_type`."""
+    named = str(np.asarray(data.get("surface_model_type", "")).reshape(-1)[:1])
+    return width == _SMPLX or "smplx" in named
 
 
 def write_body(

@@ -1,0 +1,1 @@
+"""Body formats: every `BodyFormat` in a module of this folder is read."""

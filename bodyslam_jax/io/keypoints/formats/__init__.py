@@ -1,0 +1,1 @@
+"""Keypoint formats: every `KeypointFormat` in a module of this folder is read."""
