@@ -22,6 +22,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from lifter_scene import (
     CAMERA,
     FRAMES,
@@ -55,6 +56,11 @@ def read_prior(path: Path) -> PosturePrior:
     return PosturePrior(*(np.load(path)[name].astype(float) for name in names))
 
 
+def decoded(prior: PosturePrior, latent: ArrayLike) -> np.ndarray:
+    """θ of joints 1 to 21 of each frame, (n, 63) rad."""
+    return np.asarray(prior.angles(jnp.asarray(latent)))
+
+
 def of_prior(
     prior: PosturePrior, motion: Motion, skeleton: Skeleton
 ) -> tuple[float, float, float]:
@@ -71,7 +77,7 @@ def of_prior(
                 for k in range(0, len(a), FRAMES)
             ]
         )[:, :22]
-        for a in (angles, prior.angles(latent))
+        for a in (angles, decoded(prior, latent))
     ]
     distance = 1e3 * np.linalg.norm(joints[0] - joints[1], axis=-1).mean()
 
@@ -105,7 +111,7 @@ def of_guess(
         sigma = people.keypoint_sigma(seen, intrinsics, 0)
         given = (CAMERA, filled(view.uv), filled(sigma), 30.0)
         found, known = lift(network, *(jnp.asarray(a) for a in given))
-        angles = prior.angles(np.asarray(found.latent))
+        angles = decoded(prior, found.latent)
         guess, _ = place(skeleton, angles, np.zeros(NUM_SHAPE))
         true, _ = place(skeleton, view.angles, view.shape)
         known = np.asarray(known) & (np.arange(FRAMES) < len(sigma))
