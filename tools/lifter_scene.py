@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from lifter_detector import add_errors
+from make_posture_prior import archives
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -68,9 +69,8 @@ def read_motions(
 ) -> list[Motion]:
     """Sequences of more than a second of who is (not) in `subjects`."""
     found = []
-    for name in ("locomotion", "other"):
-        data = dict(np.load(folder / f"cmu_{name}.npz"))
-        keep = np.isin(data["seq_subject"], subjects) == within
+    for name, data, usable in archives(folder):
+        keep = usable & (np.isin(data["seq_subject"], subjects) == within)
         keep &= (data["seq_length"] >= 40) & np.isin(data["seq_phase"], phases)
         for i in np.flatnonzero(keep):
             rows = slice(
@@ -131,10 +131,13 @@ def watch(
     rng: np.random.Generator,
     noise: str,
     built_in: bool = False,
+    exact: bool = False,
 ) -> View:
     """By one camera, of a person of one shape, with a detector's errors; those of the
-    detector that ships too, if `built_in`."""
+    detector that ships too, if `built_in`. If `exact`, keypoints have no offsets that
+    are a person's own."""
     shape = rng.standard_normal(NUM_SHAPE) * _SHAPE_SPREAD
+    shape[10:] *= not exact
     angles = motion.poses[:, 1:22].reshape(-1, 63)
     joints, points = place(skeleton, angles, shape)
     R_CW, camera = _camera(motion.trans, rng)

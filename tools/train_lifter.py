@@ -1,15 +1,16 @@
 """Trains the network that guesses postures from keypoints (`bodyslam_jax.people`).
 
     python tools/train_lifter.py DATA_FOLDER OUT.npz [--steps 6000] [--start FILE]
-    python tools/train_lifter.py DATA_FOLDER OUT.npz --judge
+    python tools/train_lifter.py DATA_FOLDER OUT.npz --judge [--start FILE]
 
-`DATA_FOLDER` holds `cmu_locomotion.npz` and `cmu_other.npz`, as `make_posture_prior.py`
-reads them. A first training leaves out `CALIBRATION` too, to see by how much deviations
-are too small for people that were not learnt from; a second one has them. A quarter of
-an hour on two cores. `--start` goes on training another network in its place, whose
-deviations are widened as those of the network that ships were. `--judge` trains
-nothing: people of `HELD_OUT`, seen by made-up cameras, are fitted with the network in
-OUT.npz and without one. What came out is in `bodyslam_jax/people/assets/README.md`.
+`DATA_FOLDER` holds the files that `make_posture_prior.py` reads. A first training
+leaves out `CALIBRATION` too, to see by how much deviations are too small for people
+that were not learnt from; a second one has them. A quarter of an hour on two cores.
+`--start` goes on training another network in its place, whose deviations are widened as
+those of the network that ships were. `--judge` trains nothing: people of `HELD_OUT`,
+seen by made-up cameras, are fitted with the network in OUT.npz and without one, or with
+that of `--start`; `judge_postures.py` judges guesses alone. What came out is in
+`bodyslam_jax/people/assets/README.md`.
 """
 
 import argparse
@@ -279,16 +280,23 @@ def learn(folder: Path, out: Path, steps: int, start: Path | None) -> None:
     print("held out:", errors(network, examples(HELD_OUT, True, seed=2), *single))
 
 
-def judge(folder: Path, network: Path) -> None:
-    """Fits to keypoints of the held-out people, with guesses and without."""
-    fit.load_lifter = lambda: lift.load_lifter(network)
+def judge(folder: Path, network: Path, start: Path | None) -> None:
+    """Fits to keypoints of the held-out people, with guesses and without, or else with
+    those of `start`."""
     body = load_body_model()
     skeleton = make_skeleton(body, 0.0)
     motions = [
         m for m in read_motions(folder, HELD_OUT, True, (0,)) if len(m.poses) > 59
     ]
     camera = Intrinsics(CAMERA, *SIZE)
-    settings = {"without": PeopleFit(lift_scale=0.0), "with": PeopleFit()}
+    settings = {
+        "without": (PeopleFit(lift_scale=0.0), network),
+        "with": (PeopleFit(), network),
+    }
+    if start is not None:
+        settings = {
+            f"with those of {path}": (PeopleFit(), path) for path in (start, network)
+        }
     rows = []
     for number, motion in enumerate(motions):
         rng = np.random.default_rng(number)
@@ -297,7 +305,8 @@ def judge(folder: Path, network: Path) -> None:
         true, _ = place(skeleton, view.angles, view.shape)
         true = np.einsum("tij,tkj->tki", view.T_CH[:, :3, :3], true)
         found = [motion.walks]
-        for chosen in settings.values():
+        for chosen, path in settings.values():
+            fit.load_lifter = lambda path=path: lift.load_lifter(path)
             bodies = people.fit_bodies(seen, camera, body, 30.0, chosen)
             roots = people.roots_from_bodies(bodies, body)
             shape = np.concatenate([roots.shape[0], np.zeros(NUM_SHAPE - 10)])
@@ -314,11 +323,14 @@ def judge(folder: Path, network: Path) -> None:
         print(motion.name, *(f"{v:.0f}" for v in found[1:]), flush=True)
     rows = np.array(rows, float)
     for name, kind in (("walking", 1.0), ("other", 0.0)):
-        mean = rows[rows[:, 0] == kind, 1:].mean(0)
-        count = np.sum(rows[:, 0] == kind)
+        chosen = rows[rows[:, 0] == kind, 1:]
+        mean, count = chosen.mean(0), len(chosen)
         print(f"{name}, {count} sequences, joints and legs of the best size, mm:")
         for i, which in enumerate(settings):
-            print(f"  {which} guesses {mean[2 * i]:.1f} {mean[2 * i + 1]:.1f}")
+            print(f"  {which} {mean[2 * i]:.1f} {mean[2 * i + 1]:.1f}")
+        away = chosen[:, 2:] - chosen[:, :2]
+        error = away.std(0, ddof=1) / np.sqrt(count)
+        print("  difference", *away.mean(0).round(2), "+-", *error.round(2))
 
 
 def main() -> None:
@@ -330,7 +342,7 @@ def main() -> None:
     parser.add_argument("--judge", action="store_true")
     options = parser.parse_args()
     if options.judge:
-        judge(options.data, options.out)
+        judge(options.data, options.out, options.start)
     else:
         learn(options.data, options.out, options.steps, options.start)
 
