@@ -36,6 +36,7 @@ from bodyslam_jax.online.window import FRAMES, Measured, Solved, Window, between
 from bodyslam_jax.people.filter import Body, PersonFilter
 from bodyslam_jax.people.live import LivePeople
 from bodyslam_jax.pipeline.run import assemble
+from bodyslam_jax.pipeline.to_metric import sole_height
 from bodyslam_jax.sfm.live_map import LiveMap
 from bodyslam_jax.sfm.live_tracks import PointFollower
 from bodyslam_jax.sfm.person_mask import draw_person
@@ -54,14 +55,15 @@ _RELOCATE_EVERY = 3
 """Frames between two attempts to locate a lost camera."""
 _LOST = 2.0
 """s after which a lost camera that sees points begins a new map."""
-_PENDING = 5 * CHUNK
-"""Most frames that wait for the window; of older ones only the time is kept."""
+_PENDING = 10 * CHUNK
+"""Most frames that wait for the window when it begins with them; if there are more, it
+goes on at the newest ones, and the others keep the cameras that the map located."""
+_NEWEST = 2 * CHUNK
+"""Frames that are left then."""
 _BRIDGED = 2
 """Most frames of the window in a row that are taken for located without an image."""
 _GONE = 0.5
 """s without keypoints after which a person is not in the estimate."""
-_OF_FRONT = 8 * FRAMES
-"""Frames of the window whose first poses are remembered until it has solved them."""
 _TWO_MAPS = (
     "the camera was lost and a new map began: the way between the two maps is not known"
 )
@@ -77,7 +79,7 @@ class _Counts:
     late: int = 0
     lost: int = 0
     relocated: int = 0
-    stripped: int = 0
+    skipped: int = 0
 
 
 class Online:
@@ -119,7 +121,7 @@ class Online:
         self.stride = max(1, round(fps / _RATE))
         self.step = self.stride / fps
         self.pool = ThreadPoolExecutor(1) if threads else None
-        self.job: Future[Solved] | None = None
+        self.job: Future[list[Solved]] | None = None
         self.found = LivePeople(fps, config.detection, config.association)
         self.counts, self.record = _Counts(), Record()
         self.latest: Estimate | None = None
@@ -167,6 +169,7 @@ class Online:
         body = one.body()
         given = np.eye(4), body.T_CH, body.body_pose, np.zeros(10), self.body, None
         placed(0, *given)
+        sole_height(self.body, np.zeros(10))
         joints_of(self.body, np.zeros((FRAMES, 23, 3)), np.zeros(10))
         self.prepared = True
 
@@ -447,15 +450,8 @@ class Online:
         while self.next_slot < slot:
             self._put(self._empty(self.next_slot, here))
         if slot == self.next_slot:
-            measured = Measured(
-                self.first_time + slot * self.step,
-                here,
-                T_WC is not None,
-                ids,
-                uv,
-                people,
-            )
-            self._put(measured)
+            located = T_WC is not None
+            self._put(Measured(timestamp, here, located, ids, uv, people))
         last = self.next_slot - 1
         since = np.linalg.inv(self.front[last]) @ here
         self._note_frame(timestamp, last, since, T_WC is not None, people)
@@ -467,7 +463,6 @@ class Online:
 
     def _put(self, measured: Measured) -> None:
         self.front[self.next_slot] = measured.T_WC
-        self.front.pop(self.next_slot - _OF_FRONT, None)
         self.pending.append((self.next_slot, measured))
         self.next_slot += 1
 
@@ -545,18 +540,13 @@ class Online:
     def _submit(self, flush: bool) -> None:
         """Hands the frames that wait to the window, if it has nothing to do."""
         if self.job is not None:
-            excess = len(self.pending) - _PENDING
-            for k in range(max(excess, 0)):
-                slot, measured = self.pending[k]
-                if measured.located or measured.people:
-                    self.counts.stripped += 1
-                    self.pending[k] = slot, self._empty(slot, measured.T_WC)
             return
-        count = min(len(self.pending) // CHUNK * CHUNK, _PENDING)
-        if flush and len(self.pending) % CHUNK:
-            while len(self.pending) % CHUNK:
-                self._put(self._empty(self.next_slot, self.map.T_WC))
-            count = min(len(self.pending), _PENDING)
+        while flush and len(self.pending) % CHUNK:
+            self._put(self._empty(self.next_slot, self.map.T_WC))
+        count = len(self.pending) // CHUNK * CHUNK
+        if count > _PENDING and not flush:
+            self._skip(count - _NEWEST)
+            count = _NEWEST
         if not count:
             return
         # The map may have been corrected since these frames came.
@@ -572,16 +562,28 @@ class Online:
             self.job.set_result(self.window.advance(frames))
             self._collect(wait=True)
 
+    def _skip(self, count: int) -> None:
+        """Lets the oldest frames that wait go without the window."""
+        for slot, measured in self.pending[:count]:
+            pose = self.front[slot]
+            self.record.pass_over(self.number, slot, measured, pose)
+            self.counts.skipped += measured.located
+        del self.pending[:count]
+        self.window.skip(count)
+
     def _collect(self, wait: bool) -> None:
         """Takes in what the window has found, if it is there."""
         if self.job is None or not (wait or self.job.done()):
             return
-        solved = self.job.result()
+        windows = self.job.result()
         self.job = None
+        for solved in windows:
+            self.record.keep(self.number, solved)
+            self.world.learn(solved, self.body)
+            for name, value in solved.seconds.items():
+                self.seconds[name] = self.seconds.get(name, 0.0) + value
+        solved = windows[-1]
         first = solved.first
-        self.record.keep(self.number, solved)
-        for name, value in solved.seconds.items():
-            self.seconds[name] = self.seconds.get(name, 0.0) + value
         located = np.flatnonzero(solved.located[CHUNK:])
         if len(located):
             k = CHUNK + int(located[-1])
@@ -591,8 +593,9 @@ class Online:
             self.front = {i: move @ T for i, T in self.front.items()}
             places = [p.moved(move) for p in self.follower.places]
             self.follower.places = deque(places, maxlen=self.follower.places.maxlen)
+        # A window that comes later begins no earlier.
+        self.front = {i: T for i, T in self.front.items() if i >= first + CHUNK}
         self.map.forget(self.follower.ids)
-        self.world.learn(solved, self.body)
         for h, person in enumerate(solved.people):
             if person is not None and solved.present[h].any():
                 last = int(np.flatnonzero(solved.present[h])[-1])
@@ -618,8 +621,8 @@ class Online:
                 f"the camera was lost {counts.lost} times and found again "
                 f"{counts.relocated} times"
             )
-        if counts.stripped:
+        if counts.skipped:
             notes.append(
-                f"{counts.stripped} frames were not in the graph: the machine was slow"
+                f"{counts.skipped} frames were not in the graph: the machine was slow"
             )
         return notes

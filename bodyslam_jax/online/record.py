@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
-from bodyslam_jax.online.window import SCALE_WALK, Solved, between
+from bodyslam_jax.online.window import SCALE_WALK, Measured, Solved, between
 from bodyslam_jax.types import (
     Intrinsics,
     JointEstimate,
@@ -97,6 +97,17 @@ class Record:
         for track, place in solved.landmarks.items():
             if len(self.landmarks) < _MOST_LANDMARKS:
                 self.landmarks[number, track] = told[0], place
+
+    def pass_over(
+        self,
+        number: int,
+        slot: int,
+        measured: Measured,
+        T_WC: Float[np.ndarray, "4 4"],
+    ) -> None:
+        """Keeps the camera (map units) of a frame that the window does not get."""
+        given = measured.time, T_WC, measured.located, {}
+        self.slots[number, slot] = Slot(*given)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,6 +24,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics.scale_uncertainty import inflate_fitted_shapes
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.lengths import put
 from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
@@ -75,7 +76,7 @@ class Measured:
     """What the front end found in one frame."""
 
     time: float
-    """s"""
+    """s; within half a step of the window's rate from where it stands in it."""
     T_WC: Float[np.ndarray, "4 4"]
     """Map units; a guess where not `located`."""
     located: bool
@@ -114,8 +115,6 @@ class Solved:
     """Map units, by the number of the track."""
     contacts: Float[np.ndarray, "h t 4"]
     """Probability that left toe, left heel, right toe, right heel stand."""
-    left: slice
-    """Frames that leave the window with the next ones."""
     seconds: dict[str, float]
     """Of the parts of this step."""
 
@@ -138,8 +137,9 @@ class Window:
         """Measured frames in the window, after the past."""
         self.solved_until = -CHUNK
         """The first frame that no solve has seen."""
-        self.first = -CHUNK
-        """Number of its first frame; frames of the map count from 0."""
+        self.first = self.start = -CHUNK
+        """Number of its first frame, now and at first; frames of the map count from 0.
+        """
         self.times = np.arange(FRAMES) / fps
         self.cameras = np.tile(np.eye(4), (FRAMES, 1, 1))
         self.located = np.zeros(FRAMES, bool)
@@ -184,29 +184,53 @@ class Window:
         self.book = book
         self.predictor, self.stands = told
 
-    def advance(self, frames: list[Measured]) -> Solved:
+    def skip(self, frames: int) -> None:
+        """Goes on as many frames later, in the same map: nothing is known of cameras,
+        landmarks and postures there, but people and s are as they were."""
+        self.prior = None
+        people = list(self.people)
+        told = self.steps_told, self.ground_told, self.pixel_sigma
+        at = self.first + self.count + frames
+        scale, variance = self.scale, self.scale_sigma**2
+        self.restart()
+        self.people = people
+        self.steps_told, self.ground_told, self.pixel_sigma = told
+        self.shapes = np.array([self._known_shape(p) for p in self.people])
+        self.began[:] = -1
+        self.first = self.start = self.solved_until = at
+        walked = (scale * SCALE_WALK) ** 2 * frames / self.fps
+        self.scale, self.scale_sigma = scale, (variance + walked) ** 0.5
+
+    def advance(self, frames: list[Measured]) -> list[Solved]:
         """Takes more frames in, solves, and lets the oldest go.
 
-        Of several chunks that waited only the newest is followed by a solve.
+        Of several chunks that waited the newest is followed by a solve, and an earlier
+        one only where a chunk would leave before it was solved with all frames that its
+        landmarks reach.
+
+        **Returns:** the window after each of these solves: what leaves it is as the
+        last of them that has it.
 
         **Raises:** `ValueError` if these are not whole chunks of ten frames.
         """
         if not frames or len(frames) % CHUNK:
             raise ValueError(f"frames: {len(frames)}, expected a multiple of {CHUNK}.")
-        clock = _Clock()
+        solved, clock = [], _Clock()
         for start in range(0, len(frames), CHUNK):
             if self.count == FRAMES - CHUNK:
-                fresh = self.first + 2 * CHUNK > self.solved_until
-                if fresh or len(self.state.cameras) < PRIOR + CHUNK:
-                    self._solve(clock)
+                # Landmarks of the chunk that leaves go with all their observations:
+                # without those in later frames the map would be cut there.
+                cut = self.first + PRIOR > self.solved_until
+                if cut or len(self.state.cameras) < PRIOR + CHUNK:
+                    solved.append(self._solve(clock))
+                    clock = _Clock()
                 self._move_on()
                 clock("marginalise")
             self._take(frames[start : start + CHUNK])
-        contacts = self._solve(clock)
-        return self._solved(contacts, clock.seconds)
+        return [*solved, self._solve(clock)]
 
-    def _solve(self, clock: "_Clock") -> Float[np.ndarray, "h t 4"]:
-        """Solves the window as it is; the probabilities of contact."""
+    def _solve(self, clock: "_Clock") -> Solved:
+        """Solves the window as it is."""
         sequence, state, roots = self._start()
         clock("start")
         problem, state, told = self._problem(sequence, state, roots)
@@ -224,7 +248,7 @@ class Window:
         self._keep(problem, state, told)
         clock("contacts")
         self.solved_until = self.first + CHUNK + self.count
-        return contacts
+        return self._solved(contacts, clock.seconds)
 
     # What comes in.
 
@@ -233,9 +257,11 @@ class Window:
         if self.count == 0:  # The past of the first window is nothing.
             self.cameras[:] = frames[0].T_WC
         step = 1 / self.fps
-        self.times[at:] = frames[0].time + step * np.arange(FRAMES - at)
-        before = self.times[at] - step * np.arange(at, 0, -1)
-        self.times[:at] = before if self.count == 0 else self.times[:at]
+        if self.count == 0:
+            self.times[:at] = frames[0].time - step * np.arange(at, 0, -1)
+        self.times[at : at + CHUNK] = [frame.time for frame in frames]
+        later = np.arange(1, FRAMES - at - CHUNK + 1)
+        self.times[at + CHUNK :] = frames[-1].time + step * later
         for k, frame in enumerate(frames, start=at):
             self.cameras[k:] = frame.T_WC
             self.located[k] = frame.located
@@ -249,7 +275,7 @@ class Window:
                     self.uv[h, k] = points[:, :2]
                     self.confidence[h, k] = points[:, 2]
         self.count += CHUNK
-        if self.first == -CHUNK:
+        if self.first == self.start:
             self._fix_gauge()
 
     def _fix_gauge(self) -> None:
@@ -306,8 +332,12 @@ class Window:
         self.known[h] = False
         self.uv[h], self.confidence[h] = 0.0, 0.0
         self.roots[h], self.poses[h] = np.eye(4), 0.0
-        self.shapes[h] = self.book.get(person, (np.zeros(10), None))[0]
+        self.shapes[h] = self._known_shape(person)
         return h
+
+    def _known_shape(self, person: int | None) -> Float[np.ndarray, " 10"]:
+        known = None if person is None else self.book.get(person)
+        return np.zeros(10) if known is None else known[0]
 
     def _leave(self, h: int) -> None:
         """Frees a place; what is known of the person's shape goes into the book."""
@@ -329,13 +359,14 @@ class Window:
         sequence = Sequence(
             name="window",
             frames=None,
-            timestamps=self.times - self.times[0],
+            # Even times: the motion model's programs depend on how they lie.
+            timestamps=np.arange(FRAMES) / self.fps,
             intrinsics=self.intrinsics,
             keypoints=keypoints,
         )
-        bodies = people.fit_bodies(
-            keypoints, self.intrinsics, self.body, self.fps, self.config.people_fit
-        )
+        given = keypoints, self.intrinsics, self.body, self.fps
+        settings = self.config.people_fit
+        bodies = people.fit_bodies(*given, settings, common_length=True)
         roots = people.roots_from_bodies(bodies, self.body)
         for h in range(self.places):
             self._start_person(h, roots)
@@ -380,7 +411,7 @@ class Window:
         weights = self.config.weights
         measured = np.arange(FRAMES) >= CHUNK
         tracks, places = self._tracks()
-        state = eqx.tree_at(lambda s: s.landmarks, state, jnp.asarray(places))
+        state = eqx.tree_at(lambda s: s.landmarks, state, put(places))
         sigma = initialisation.landmark_sigma(self.pixel_sigma, weights)
         cameras = initialisation.map_factor(
             tracks, np.ones(len(tracks.frame), bool), sigma, weights
@@ -410,9 +441,10 @@ class Window:
         factors = [*of_people, moved, ground]
         factors = [cameras, *(in_frames(f, measured) for f in factors)]
         if self.prior is None:
-            self.prior = priors.no_prior(state, PRIOR, 2)
+            nothing = priors.no_prior(state, PRIOR, 2)
+            self.prior = priors.with_scale(nothing, self.scale_sigma)
         metric = np.isfinite(self.scale_sigma) or bool((told > 0).any())
-        free = state.zero_step()
+        free = dataclasses.replace(state, landmarks=put(places[:0])).zero_step()
         ones = lambda x, mask: jnp.ones_like(x) * jnp.asarray(mask, x.dtype)
         past = np.asarray(np.arange(FRAMES) >= CHUNK - self.prior.reach)
         last = np.asarray(np.arange(FRAMES) >= CHUNK - 1)
@@ -425,7 +457,7 @@ class Window:
             roots=ones(free.roots, (there & past)[..., None]),
             poses=ones(free.poses, (there & last)[..., None, None]),
             shapes=ones(free.shapes, np.asarray(there.any(axis=1))[:, None]),
-            landmarks=jnp.ones_like(state.landmarks),
+            landmarks=put(np.ones(places.shape)),
         )
         problem = graph.make_problem(
             [*factors, self.prior],
@@ -684,7 +716,8 @@ class Window:
             setattr(self, name, move(getattr(self, name), 0))
         for name in ("uv", "confidence", "roots", "poses", "known"):
             setattr(self, name, move(getattr(self, name), 1))
-        self.times = self.times + CHUNK / self.fps
+        last = self.times[-1] + np.arange(1, CHUNK + 1) / self.fps
+        self.times = np.concatenate([self.times[CHUNK:], last])
         self.known[:, FRAMES - CHUNK :] = False
         self.confidence[:, FRAMES - CHUNK :] = 0.0
         self.seen = self.seen[CHUNK:] + [_NOTHING] * CHUNK
@@ -715,8 +748,6 @@ class Window:
 
     def _solved(self, contacts: np.ndarray, seconds: dict[str, float]) -> Solved:
         shown = slice(0, CHUNK + self.count)
-        full = self.count == FRAMES - CHUNK
-        left = slice(CHUNK, 2 * CHUNK) if full else slice(0, 0)
         return Solved(
             first=self.first,
             times=self.times[shown].copy(),
@@ -735,7 +766,6 @@ class Window:
                 if i in self.track
             },
             contacts=contacts[:, shown],
-            left=left,
             seconds=seconds,
         )
 
@@ -808,5 +838,5 @@ class _Clock:
 
     def __call__(self, name: str) -> None:
         now = time.perf_counter()
-        self.seconds[name] = round(now - self.last, 4)
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self.last
         self.last = now
