@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
-from bodyslam_jax.online.window import SCALE_WALK, Measured, Solved, between
+from bodyslam_jax.online.window import SCALE_WALK, Solved
+from bodyslam_jax.online.window_content import Measured, between
 from bodyslam_jax.types import (
     Intrinsics,
     JointEstimate,
@@ -53,6 +54,37 @@ class Slot:
     located: bool
     people: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
     """T_CH, θ and contacts."""
+
+
+@dataclasses.dataclass
+class Counts:
+    """What happened, for the notes of the result."""
+
+    frames: int = 0
+    """Used."""
+    late: int = 0
+    """With a time that is not after that of the one before."""
+    lost: int = 0
+    """How often the camera fitted the map nowhere."""
+    relocated: int = 0
+    skipped: int = 0
+    """Frames that the window did not get."""
+
+    def notes(self) -> list[str]:
+        """What to know about the result, a line each."""
+        notes = []
+        if self.late:
+            notes.append(f"{self.late} frames came late or twice and were not used")
+        if self.lost:
+            notes.append(
+                f"the camera was lost {self.lost} times and found again "
+                f"{self.relocated} times"
+            )
+        if self.skipped:
+            notes.append(
+                f"{self.skipped} frames were not in the graph: the machine was slow"
+            )
+        return notes
 
 
 class Record:
@@ -98,15 +130,9 @@ class Record:
             if len(self.landmarks) < _MOST_LANDMARKS:
                 self.landmarks[number, track] = told[0], place
 
-    def pass_over(
-        self,
-        number: int,
-        slot: int,
-        measured: Measured,
-        T_WC: Float[np.ndarray, "4 4"],
-    ) -> None:
-        """Keeps the camera (map units) of a frame that the window does not get."""
-        given = measured.time, T_WC, measured.located, {}
+    def pass_over(self, number: int, slot: int, measured: Measured) -> None:
+        """Keeps the camera of a frame that the window does not get."""
+        given = measured.time, measured.T_WC, measured.located, {}
         self.slots[number, slot] = Slot(*given)
 
 
