@@ -71,6 +71,19 @@ def test_a_map_grows_from_two_views_and_locates_every_frame():
     assert np.linalg.norm(away, axis=1).max() < 0.05  # m, of 4.5 m
 
 
+def test_rounding_of_one_pose_is_not_in_the_next():
+    """A guess is made of two poses: their rounding would be extrapolated and grow."""
+    scene = LiveMap(CAMERA)
+    for _, ids, uv in passing(60, np.random.default_rng(0)):
+        if not scene.begun:
+            scene.begin(ids, uv)
+            continue
+        scene.T_WC[:3, :3] *= 1 + 1e-9
+        T = scene.locate(ids, uv)
+        assert T is not None
+        assert np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-12
+
+
 def test_a_camera_that_only_turns_begins_no_map():
     rng, scene = np.random.default_rng(1), LiveMap(CAMERA)
     points = rng.uniform([-6, -2, 3], [6, 2, 8], (300, 3))

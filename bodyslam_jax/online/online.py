@@ -20,6 +20,7 @@ from jaxtyping import Float, Int, UInt8
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.io.camera.calibration import guess_camera, project_points, with_focal
 from bodyslam_jax.online.bodies import LiveBodies
@@ -470,7 +471,8 @@ class Online:
             k = CHUNK + int(located[-1])
             before, after = self.slots.front[first + k], solved.T_WC[k]
             move = after @ np.linalg.inv(before)
-            self.map.corrected(before, after, solved.landmarks)
+            move[:3, :3] = so3.nearest(move[:3, :3])
+            self.map.corrected(move, solved.landmarks)
             self.slots.move(move)
             places = [p.moved(move) for p in self.follower.places]
             self.follower.places = deque(places, maxlen=self.follower.places.maxlen)

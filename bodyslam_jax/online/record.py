@@ -105,19 +105,20 @@ class Record:
         """Keeps the frames of a window of map `number`, in place of what an earlier
         window had of them."""
         first = solved.first
+        # Copies: a row of an array would keep all of it.
         for k in range(CHUNK, len(solved.times)):
             people = {
                 person: (
-                    solved.roots[h, k],
-                    solved.poses[h, k],
-                    solved.contacts[h, k],
+                    solved.roots[h, k].copy(),
+                    solved.poses[h, k].copy(),
+                    solved.contacts[h, k].copy(),
                 )
                 for h, person in enumerate(solved.people)
                 if person is not None and solved.present[h, k]
             }
             self.slots[number, first + k] = Slot(
                 float(solved.times[k]),
-                solved.T_WC[k],
+                solved.T_WC[k].copy(),
                 bool(solved.located[k]),
                 people,
             )
@@ -128,7 +129,7 @@ class Record:
         self.scales.setdefault(number, []).append(told)
         for track, place in solved.landmarks.items():
             if len(self.landmarks) < _MOST_LANDMARKS:
-                self.landmarks[number, track] = told[0], place
+                self.landmarks[number, track] = told[0], place.copy()
 
     def pass_over(self, number: int, slot: int, measured: Measured) -> None:
         """Keeps the camera of a frame that the window does not get."""
