@@ -10,6 +10,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 LENGTHS = (20, 60, 120, 200, 340, 600, 1020)
 """Padded lengths, frames. Padding makes a video of 30 to 1,020 frames longer by a
@@ -39,6 +40,15 @@ def padded_rows(count: int) -> int:
     """Returns the next power of two, for tables whose length is not a number of
     frames."""
     return 1 << max(count - 1, 0).bit_length()
+
+
+def put(x: Any, dtype: Any = None) -> Array:
+    """`jnp.asarray` of an array of any shape, which compiles nothing.
+
+    `jnp.asarray` compiles and keeps a program of a MiB for each shape that it meets:
+    tables of tracks have another one in every window of a video.
+    """
+    return jax.device_put(np.asarray(x, dtype))
 
 
 def lengthened(tree: Any, frames: int, axis: int = 0) -> Any:

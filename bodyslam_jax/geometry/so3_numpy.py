@@ -66,6 +66,12 @@ def interpolate_path(
     return Slerp(times, Rotation.from_matrix(rotations))(at).as_matrix()
 
 
+def nearest(matrix: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3 3"]:
+    """The rotation that is nearest to a matrix: what rounding has left of one."""
+    U, _, Vt = np.linalg.svd(matrix)
+    return U @ Vt
+
+
 def from_quaternion(xyzw: Float[np.ndarray, "*b 4"]) -> Float[np.ndarray, "*b 3 3"]:
     """Converts quaternions of any length but 0 to rotation matrices."""
     rotation = Rotation.from_quat(xyzw.reshape(-1, 4))

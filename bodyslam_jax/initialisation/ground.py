@@ -12,7 +12,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import BODY25_ANKLES_AND_FEET
 from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.geometry.ground_plane import find_ground
-from bodyslam_jax.geometry.lengths import padded_length
+from bodyslam_jax.geometry.lengths import padded_length, put
 from bodyslam_jax.geometry.local_ground import ground_under, running_median, wander
 from bodyslam_jax.initialisation.upright import mean_up
 from bodyslam_jax.types import Keypoints
@@ -106,7 +106,7 @@ def heights_of_camera(
 ) -> Float[np.ndarray, "h t"]:
     """Returns the height of the camera over the ground under each person, units of the
     map."""
-    eyes = np.asarray(state.cameras[:, :3, 3] @ contact.normal)
+    eyes = np.asarray(state.cameras)[:, :3, 3] @ np.asarray(contact.normal)
     return eyes + np.asarray(contact.offset)
 
 
@@ -123,15 +123,15 @@ def _ground(
 ) -> tuple[graph.GroundContact | None, Bool[np.ndarray, "h t"]]:
     """Returns the factor with σ = 1, and the frames in which it is used."""
     landmarks = np.asarray(state.landmarks)
-    eyes = np.asarray(state.cameras[:, :3, 3])
+    eyes = np.asarray(state.cameras)[:, :3, 3]
     up = mean_up(state, visible)
     plane = find_ground(landmarks, eyes, up)
     normal, d = (up, 0.0) if plane is None else (plane[:3], plane[3])
     contact = graph.GroundContact(
         body,
-        jnp.asarray(normal),
-        jnp.full(visible.shape, d),
-        jnp.where(visible, 1.0, jnp.inf),
+        put(normal),
+        put(np.full(visible.shape, d)),
+        put(np.where(visible, 1.0, np.inf)),
     )
     _, soles = _scales_and_soles(contact, state)
     rays = np.einsum("tij,htj->hti", np.asarray(state.cameras[:, :3, :3]), soles)

@@ -6,6 +6,7 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax import graph
 from bodyslam_jax.config import PATH_SIGMA, GraphWeights
+from bodyslam_jax.geometry.lengths import put
 from bodyslam_jax.types import Tracks
 
 PIXEL_SIGMA_RANGE = (0.3, 3.0)
@@ -29,10 +30,10 @@ def map_factor(
     """
     sigma = landmark_sigma(sigma, weights)
     return graph.Reprojection(
-        frame=jnp.asarray(tracks.frame, jnp.int32),
-        landmark=jnp.asarray(tracks.landmark, jnp.int32),
-        pixel=jnp.asarray(tracks.uv, float),
-        sigma=jnp.asarray(np.where(keep, sigma, np.inf)),
+        frame=put(tracks.frame, np.int32),
+        landmark=put(tracks.landmark, np.int32),
+        pixel=put(tracks.uv, float),
+        sigma=put(np.where(keep, sigma, np.inf)),
         loss=graph.Cauchy(jnp.asarray(weights.landmark_loss)),
     )
 

@@ -11,6 +11,7 @@ from bodyslam_jax.body import BodyModel, local_joints
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.levelling import upright
+from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.online.window import Solved
 from bodyslam_jax.pipeline.to_metric import sole_height
 
@@ -84,6 +85,8 @@ class World:
         default_factory=lambda: np.zeros(3)
     )
     """Sum of the trunks of frames that have left the window, in the map."""
+    inside: dict[int, Float[np.ndarray, " 3"]] = dataclasses.field(default_factory=dict)
+    """The trunks of each frame of the last window, by its number."""
     height: float | None = None
     """Of the first camera over the floor, m."""
 
@@ -101,13 +104,14 @@ class World:
         ups = solved.roots[..., :3, 1]
         trunks = np.einsum("tij,htj->hti", solved.T_WC[:, :3, :3], ups)
         there = solved.present & solved.located
-        left = np.zeros(len(solved.times), bool)
-        left[solved.left] = True
-        total = self.trunks + trunks[there].sum(axis=0)
-        self.trunks = self.trunks + trunks[there & left].sum(axis=0)
+        sums = np.where(there[..., None], trunks, 0.0).sum(axis=0)
+        first = solved.first + CHUNK
+        gone = [x for k, x in self.inside.items() if k < first]
+        self.trunks = self.trunks + np.array(gone).reshape(-1, 3).sum(axis=0)
+        self.inside = dict(enumerate(sums[CHUNK:], start=first))
+        total = self.trunks + sums[CHUNK:].sum(axis=0)
         if np.linalg.norm(total) > 1e-9:
-            first = np.eye(4)[None]
-            self.turn = upright(first, total / np.linalg.norm(total))[:3, :3]
+            self.turn = upright(np.eye(4)[None], total / np.linalg.norm(total))[:3, :3]
         if known:
             self._find_floor(solved, body, there)
 

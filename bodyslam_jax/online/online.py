@@ -17,28 +17,27 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from bodyslam_jax import solver
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.io.camera.calibration import guess_camera, project_points, with_focal
+from bodyslam_jax.online.bodies import LiveBodies
 from bodyslam_jax.online.estimate import (
     Estimate,
     PersonEstimate,
     World,
-    joints_of,
     placed,
 )
-from bodyslam_jax.online.invented import invented
-from bodyslam_jax.online.record import Record, Seen, parts_of
-from bodyslam_jax.online.window import FRAMES, Measured, Solved, Window, between
-from bodyslam_jax.people.filter import Body, PersonFilter
-from bodyslam_jax.people.live import LivePeople
+from bodyslam_jax.online.prepare import compile_all
+from bodyslam_jax.online.record import Counts, Record, Seen, parts_of
+from bodyslam_jax.online.slots import Slots
+from bodyslam_jax.online.window import Solved, Window
+from bodyslam_jax.online.window_content import FRAMES, Measured
 from bodyslam_jax.pipeline.run import assemble
 from bodyslam_jax.sfm.live_map import LiveMap
 from bodyslam_jax.sfm.live_tracks import PointFollower
-from bodyslam_jax.sfm.person_mask import draw_person
 from bodyslam_jax.types import Intrinsics, Result, Sequence, SfmResult
 
 log = logging.getLogger(__name__)
@@ -46,38 +45,22 @@ log = logging.getLogger(__name__)
 _RATE = 10.0
 """Frames of the window in a second, at most: what two cores solve while the video runs
 (`benchmarks/online.md`)."""
-_MARGIN = 0.06
-"""Width that is masked around people, of their height, as offline."""
 _PLACE_EVERY = 2.0
 """s between two places that are remembered."""
 _RELOCATE_EVERY = 3
 """Frames between two attempts to locate a lost camera."""
 _LOST = 2.0
 """s after which a lost camera that sees points begins a new map."""
-_PENDING = 5 * CHUNK
-"""Most frames that wait for the window; of older ones only the time is kept."""
-_BRIDGED = 2
-"""Most frames of the window in a row that are taken for located without an image."""
-_GONE = 0.5
-"""s without keypoints after which a person is not in the estimate."""
-_OF_FRONT = 8 * FRAMES
-"""Frames of the window whose first poses are remembered until it has solved them."""
+_PENDING = 10 * CHUNK
+"""Most frames that wait for the window when it begins with them; if there are more, it
+goes on at the newest ones, and the others keep the cameras that the map located."""
+_NEWEST = 2 * CHUNK
+"""Frames that are left then."""
 _TWO_MAPS = (
     "the camera was lost and a new map began: the way between the two maps is not known"
 )
 _POINTS_AGAIN = 100
 """Points that a camera begins with where it was lost."""
-
-
-@dataclasses.dataclass
-class _Counts:
-    """What happened, for the notes of the result."""
-
-    frames: int = 0
-    late: int = 0
-    lost: int = 0
-    relocated: int = 0
-    stripped: int = 0
 
 
 class Online:
@@ -119,15 +102,12 @@ class Online:
         self.stride = max(1, round(fps / _RATE))
         self.step = self.stride / fps
         self.pool = ThreadPoolExecutor(1) if threads else None
-        self.job: Future[Solved] | None = None
-        self.found = LivePeople(fps, config.detection, config.association)
-        self.counts, self.record = _Counts(), Record()
+        self.job: Future[list[Solved]] | None = None
+        self.bodies = LiveBodies(config, self.body, fps)
+        self.counts, self.record = Counts(), Record()
         self.latest: Estimate | None = None
         self.started = self.prepared = False
         self.done = False
-        self.filters: dict[int, PersonFilter] = {}
-        self.last_seen: dict[int, float] = {}
-        self.contacts: dict[int, np.ndarray] = {}
         self.warnings: dict[str, None] = {}
         self.seconds: dict[str, float] = {}
         self.number = -1
@@ -155,25 +135,11 @@ class Online:
                 raise InputError("prepare: found neither intrinsics nor a size.")
             self.intrinsics = self._guess(*size)
         if self.config.people and self.config.detect != "none":
-            self.found.load_networks()
-        frames, points = invented(self.intrinsics, self.body, self.step)
-        scratch = Window(*self._of_window())
-        scratch.advance(frames[: FRAMES - CHUNK])
-        scratch.advance(frames[FRAMES - CHUNK :])
-        solver.marginals(scratch.problem, scratch.state)
-        one = PersonFilter(self.intrinsics, self.body, self.fps, self.config.people_fit)
-        one.update(0.0, points, np.zeros(10))
-        one.update(1 / self.fps, points, np.zeros(10))
-        body = one.body()
-        given = np.eye(4), body.T_CH, body.body_pose, np.zeros(10), self.body, None
-        placed(0, *given)
-        joints_of(self.body, np.zeros((FRAMES, 23, 3)), np.zeros(10))
+            self.bodies.found.load_networks()
+        given = self.intrinsics, self.body, self.config
+        rates = {"fps": self.fps, "step": self.step}
+        compile_all(*given, **rates, places=self.places)
         self.prepared = True
-
-    def _of_window(self) -> tuple:
-        assert self.intrinsics is not None
-        rest = self.config, 1 / self.step, self.places
-        return self.intrinsics, self.body, *rest
 
     # Every frame.
 
@@ -211,14 +177,17 @@ class Online:
         assert self.intrinsics is not None
         if image is None and points is None:
             raise InputError("update: found neither an image nor points.")
-        people = self._find(image, keypoints)
+        people = self.bodies.find(image, keypoints)
         gray = None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if points is None:
             assert gray is not None
-            points = self.follower.advance(gray, self._mask(people))
+            points = self.follower.advance(
+                gray, self.bodies.mask(people, self.intrinsics)
+            )
         self._collect(wait=False)
         status = self._locate(timestamp, gray, *points, people)
-        bodies = self._filter(timestamp, people)
+        shapes = self.record.shapes
+        bodies = self.bodies.follow(timestamp, people, self.intrinsics, shapes)
         self._submit(flush=False)
         self.counts.frames += 1
         self.latest = self._estimate(timestamp, status, bodies)
@@ -246,7 +215,7 @@ class Online:
             self.intrinsics,
             self.name,
             1 / self.step,
-            (*self.warnings, *self._told()),
+            (*self.warnings, *self.counts.notes()),
         )
         if _TWO_MAPS in self.warnings:
             measured = dataclasses.replace(measured, contradictions=(_TWO_MAPS,))
@@ -290,7 +259,8 @@ class Online:
             self.intrinsics = self._guess(image.shape[1], image.shape[0])
         self.follower = PointFollower(self.intrinsics, self.config.tracking.num_points)
         self.prepare()
-        self.window = Window(*self._of_window())
+        given = self.intrinsics, self.body, self.config
+        self.window = Window(*given, 1 / self.step, self.places)
         self._begin_map()
         self.started = True
 
@@ -313,34 +283,10 @@ class Online:
         self.number += 1
         self.waiting: deque[tuple[float, dict[int, np.ndarray], np.ndarray, np.ndarray]]
         self.waiting = deque(maxlen=(FRAMES - CHUNK) * self.stride)
-        self.pending: list[tuple[int, Measured]] = []
-        self.front: dict[int, np.ndarray] = {}
-        """First poses of the frames of the window, in the map as it is now."""
-        self.next_slot, self.first_time = 0, 0.0
+        self.slots = Slots(self.step)
         self.lost_since: float | None = None
         self.last_place = -np.inf
         self.solved: Solved | None = None
-
-    def _find(
-        self, image: np.ndarray | None, keypoints: np.ndarray | None
-    ) -> dict[int, np.ndarray]:
-        if not self.config.people:
-            return {}
-        if keypoints is not None:
-            return self.found.given(np.asarray(keypoints, float), image)
-        if image is None or self.config.detect == "none":
-            return {}
-        return self.found.find(image)
-
-    def _mask(self, people: dict[int, np.ndarray]) -> np.ndarray | None:
-        if not people:
-            return None
-        assert self.intrinsics is not None
-        size = self.intrinsics.height, self.intrinsics.width
-        mask = np.zeros(size, np.uint8)
-        for points in people.values():
-            draw_person(mask, points, _MARGIN)
-        return mask
 
     def _locate(
         self,
@@ -426,50 +372,13 @@ class Online:
         people: dict[int, np.ndarray],
     ) -> None:
         """Takes a frame into the record, and those at the window's times into it."""
+        located = T_WC is not None
         here = self.map.T_WC if T_WC is None else T_WC
-        if self.next_slot == 0:
-            self.first_time = timestamp
-        slot = round((timestamp - self.first_time) / self.step)
-        gap = slot - self.next_slot
-        if gap > 2 * FRAMES:  # The source stood still: time goes on from here.
-            note = f"no frame came for {gap * self.step:.0f} s"
-            self.warnings[note] = None
-            self.first_time += (gap - FRAMES) * self.step
-            slot -= gap - FRAMES
-        if 0 < slot - self.next_slot <= _BRIDGED and T_WC is not None:
-            # Frames that the source, or a slow machine, left out.
-            ends = np.array([self.next_slot - 1, slot])
-            poses = np.array([self.front[self.next_slot - 1], here])
-            for k in range(self.next_slot, slot):
-                pose = between(ends, poses, np.array([k]))[0]
-                missing = self._empty(k, pose)
-                self._put(dataclasses.replace(missing, located=True))
-        while self.next_slot < slot:
-            self._put(self._empty(self.next_slot, here))
-        if slot == self.next_slot:
-            measured = Measured(
-                self.first_time + slot * self.step,
-                here,
-                T_WC is not None,
-                ids,
-                uv,
-                people,
-            )
-            self._put(measured)
-        last = self.next_slot - 1
-        since = np.linalg.inv(self.front[last]) @ here
-        self._note_frame(timestamp, last, since, T_WC is not None, people)
-
-    def _empty(self, slot: int, T_WC: np.ndarray) -> Measured:
-        none = np.zeros(0, int), np.zeros((0, 2))
-        at = self.first_time + slot * self.step
-        return Measured(at, T_WC, False, *none, {})
-
-    def _put(self, measured: Measured) -> None:
-        self.front[self.next_slot] = measured.T_WC
-        self.front.pop(self.next_slot - _OF_FRONT, None)
-        self.pending.append((self.next_slot, measured))
-        self.next_slot += 1
+        measured = Measured(timestamp, here, located, ids, uv, people)
+        slot, since, stood = self.slots.take(measured)
+        if stood:
+            self.warnings[f"no frame came for {stood:.0f} s"] = None
+        self._note_frame(timestamp, slot, since, located, people)
 
     def _note_frame(
         self,
@@ -482,29 +391,6 @@ class Online:
         number = self.number if slot >= 0 else -1
         kept = {p: np.asarray(x, np.float32) for p, x in people.items()}
         self.record.frames.append(Seen(timestamp, number, slot, since, located, kept))
-
-    def _filter(
-        self, timestamp: float, people: dict[int, np.ndarray]
-    ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-        """T_CH and θ of everybody who is here or was half a second ago."""
-        assert self.intrinsics is not None
-        found = {}
-        for person, points in people.items():
-            if person not in self.filters:
-                self.filters[person] = PersonFilter(
-                    self.intrinsics, self.body, self.fps, self.config.people_fit
-                )
-            self.last_seen[person] = timestamp
-        for person, one in list(self.filters.items()):
-            if timestamp - self.last_seen[person] > _GONE:
-                del self.filters[person]
-                self.contacts.pop(person, None)
-                continue
-            points = people.get(person, np.zeros((25, 3)))
-            body = one.update(timestamp, points, self._shape(person))
-            if body is not None:
-                found[person] = body.T_CH, body.body_pose
-        return found
 
     def _shape(self, person: int) -> np.ndarray:
         return self.record.shapes.get(person, np.zeros(10))
@@ -519,7 +405,9 @@ class Online:
         people: list[PersonEstimate] = []
         for person, (T_CH, pose) in sorted(bodies.items()):
             given = T_CH, pose, self._shape(person), self.body
-            people.append(placed(person, T_WC, *given, self.contacts.get(person)))
+            people.append(
+                placed(person, T_WC, *given, self.bodies.contacts.get(person))
+            )
         nan = float("nan")
         scale = sigma = nan
         if self.solved is not None and np.isfinite(self.solved.scale_sigma):
@@ -545,26 +433,19 @@ class Online:
     def _submit(self, flush: bool) -> None:
         """Hands the frames that wait to the window, if it has nothing to do."""
         if self.job is not None:
-            excess = len(self.pending) - _PENDING
-            for k in range(max(excess, 0)):
-                slot, measured = self.pending[k]
-                if measured.located or measured.people:
-                    self.counts.stripped += 1
-                    self.pending[k] = slot, self._empty(slot, measured.T_WC)
             return
-        count = min(len(self.pending) // CHUNK * CHUNK, _PENDING)
-        if flush and len(self.pending) % CHUNK:
-            while len(self.pending) % CHUNK:
-                self._put(self._empty(self.next_slot, self.map.T_WC))
-            count = min(len(self.pending), _PENDING)
+        if flush:
+            self.slots.fill(self.map.T_WC)
+        count = len(self.slots.waiting) // CHUNK * CHUNK
+        if count > _PENDING and not flush:
+            for slot, measured in self.slots.pop(count - _NEWEST):
+                self.record.pass_over(self.number, slot, measured)
+                self.counts.skipped += measured.located
+            self.window.skip(count - _NEWEST)
+            count = _NEWEST
         if not count:
             return
-        # The map may have been corrected since these frames came.
-        frames = [
-            dataclasses.replace(m, T_WC=self.front[slot])
-            for slot, m in self.pending[:count]
-        ]
-        del self.pending[:count]
+        frames = [measured for _, measured in self.slots.pop(count)]
         if self.pool is not None:
             self.job = self.pool.submit(self.window.advance, frames)
         else:
@@ -576,50 +457,33 @@ class Online:
         """Takes in what the window has found, if it is there."""
         if self.job is None or not (wait or self.job.done()):
             return
-        solved = self.job.result()
+        windows = self.job.result()
         self.job = None
+        for solved in windows:
+            self.record.keep(self.number, solved)
+            self.world.learn(solved, self.body)
+            for name, value in solved.seconds.items():
+                self.seconds[name] = self.seconds.get(name, 0.0) + value
+        solved = windows[-1]
         first = solved.first
-        self.record.keep(self.number, solved)
-        for name, value in solved.seconds.items():
-            self.seconds[name] = self.seconds.get(name, 0.0) + value
         located = np.flatnonzero(solved.located[CHUNK:])
         if len(located):
             k = CHUNK + int(located[-1])
-            before, after = self.front[first + k], solved.T_WC[k]
+            before, after = self.slots.front[first + k], solved.T_WC[k]
             move = after @ np.linalg.inv(before)
-            self.map.corrected(before, after, solved.landmarks)
-            self.front = {i: move @ T for i, T in self.front.items()}
+            move[:3, :3] = so3.nearest(move[:3, :3])
+            self.map.corrected(move, solved.landmarks)
+            self.slots.move(move)
             places = [p.moved(move) for p in self.follower.places]
             self.follower.places = deque(places, maxlen=self.follower.places.maxlen)
+        # A window that comes later begins no earlier.
+        self.slots.forget(first + CHUNK)
         self.map.forget(self.follower.ids)
-        self.world.learn(solved, self.body)
-        for h, person in enumerate(solved.people):
-            if person is not None and solved.present[h].any():
-                last = int(np.flatnonzero(solved.present[h])[-1])
-                self.contacts[person] = solved.contacts[h, last]
-                if person in self.filters:
-                    body = Body(solved.roots[h, last], solved.poses[h, last])
-                    at = float(solved.times[last])
-                    self.filters[person].anchor(at, body, self._shape(person))
+        self.bodies.learn(solved, self.record.shapes)
         self.solved = solved
 
     def _end_map(self) -> None:
         """Solves all that waits."""
-        while self.pending or self.job is not None:
+        while self.slots.waiting or self.job is not None:
             self._submit(flush=True)
             self._collect(wait=True)
-
-    def _told(self) -> list[str]:
-        counts, notes = self.counts, []
-        if counts.late:
-            notes.append(f"{counts.late} frames came late or twice and were not used")
-        if counts.lost:
-            notes.append(
-                f"the camera was lost {counts.lost} times and found again "
-                f"{counts.relocated} times"
-            )
-        if counts.stripped:
-            notes.append(
-                f"{counts.stripped} frames were not in the graph: the machine was slow"
-            )
-        return notes

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bodyslam_jax import graph
+from bodyslam_jax.geometry.lengths import put
 from bodyslam_jax.solver.marginalisation import square_root
 
 POSTURE = 69
@@ -30,6 +31,16 @@ def no_prior(state: graph.State, frames: int, reach: int) -> graph.MarginalPrior
         invariant=jnp.zeros(3, dtype),
         reach=reach,
     )
+
+
+def with_scale(prior: graph.MarginalPrior, sigma: float) -> graph.MarginalPrior:
+    """A prior without information that is to know s, as it is in its estimate; NaN
+    where s is not known."""
+    if np.isnan(sigma):
+        return prior
+    root = np.array(prior.root)
+    root[0, 0] = 1 / sigma
+    return dataclasses.replace(prior, root=put(root))
 
 
 def padded(
@@ -158,8 +169,8 @@ def _places(estimate: graph.State, reach: int) -> _Places:
 def _first_frames(state: graph.State, frames: int) -> graph.State:
     return dataclasses.replace(
         state,
-        cameras=state.cameras[:frames],
-        roots=state.roots[:, :frames],
-        poses=state.poses[:, :frames],
-        landmarks=state.landmarks[:0],
+        cameras=put(np.asarray(state.cameras)[:frames]),
+        roots=put(np.asarray(state.roots)[:, :frames]),
+        poses=put(np.asarray(state.poses)[:, :frames]),
+        landmarks=put(np.asarray(state.landmarks)[:0]),
     )

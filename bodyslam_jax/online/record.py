@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
-from bodyslam_jax.online.window import SCALE_WALK, Solved, between
+from bodyslam_jax.online.window import SCALE_WALK, Solved
+from bodyslam_jax.online.window_content import Measured, between
 from bodyslam_jax.types import (
     Intrinsics,
     JointEstimate,
@@ -55,6 +56,37 @@ class Slot:
     """T_CH, θ and contacts."""
 
 
+@dataclasses.dataclass
+class Counts:
+    """What happened, for the notes of the result."""
+
+    frames: int = 0
+    """Used."""
+    late: int = 0
+    """With a time that is not after that of the one before."""
+    lost: int = 0
+    """How often the camera fitted the map nowhere."""
+    relocated: int = 0
+    skipped: int = 0
+    """Frames that the window did not get."""
+
+    def notes(self) -> list[str]:
+        """What to know about the result, a line each."""
+        notes = []
+        if self.late:
+            notes.append(f"{self.late} frames came late or twice and were not used")
+        if self.lost:
+            notes.append(
+                f"the camera was lost {self.lost} times and found again "
+                f"{self.relocated} times"
+            )
+        if self.skipped:
+            notes.append(
+                f"{self.skipped} frames were not in the graph: the machine was slow"
+            )
+        return notes
+
+
 class Record:
     """Frames, and what is known of the maps that they are in."""
 
@@ -73,19 +105,20 @@ class Record:
         """Keeps the frames of a window of map `number`, in place of what an earlier
         window had of them."""
         first = solved.first
+        # Copies: a row of an array would keep all of it.
         for k in range(CHUNK, len(solved.times)):
             people = {
                 person: (
-                    solved.roots[h, k],
-                    solved.poses[h, k],
-                    solved.contacts[h, k],
+                    solved.roots[h, k].copy(),
+                    solved.poses[h, k].copy(),
+                    solved.contacts[h, k].copy(),
                 )
                 for h, person in enumerate(solved.people)
                 if person is not None and solved.present[h, k]
             }
             self.slots[number, first + k] = Slot(
                 float(solved.times[k]),
-                solved.T_WC[k],
+                solved.T_WC[k].copy(),
                 bool(solved.located[k]),
                 people,
             )
@@ -96,7 +129,12 @@ class Record:
         self.scales.setdefault(number, []).append(told)
         for track, place in solved.landmarks.items():
             if len(self.landmarks) < _MOST_LANDMARKS:
-                self.landmarks[number, track] = told[0], place
+                self.landmarks[number, track] = told[0], place.copy()
+
+    def pass_over(self, number: int, slot: int, measured: Measured) -> None:
+        """Keeps the camera of a frame that the window does not get."""
+        given = measured.time, measured.T_WC, measured.located, {}
+        self.slots[number, slot] = Slot(*given)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -77,7 +77,8 @@ def as_body_keypoints(
         shape = np.concatenate([roots.shape[h], np.zeros(NUM_SHAPE - 10)])
         angles = roots.body_pose[h, where, :21].reshape(-1, 63)
         rows = (T_CH[:, :3, :3], T_CH[:, :3, 3], angles, uv[h, where])
-        length = padded_length(len(where)) - len(where)
+        # As long as the clip: people who are in few of its frames share the program.
+        length = padded_length(roots.present.shape[1]) - len(where)
         last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
         silent = np.full((length, 25), np.inf)
         sigma = np.concatenate([sigma * np.sqrt(alike), silent])

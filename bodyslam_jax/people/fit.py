@@ -68,11 +68,16 @@ def fit_bodies(
     body: BodyModel,
     fps: float,
     settings: PeopleFit = PeopleFit(),
+    *,
+    common_length: bool = False,
 ) -> Bodies:
     """Fits posture, shape and position of every person to their keypoints.
 
     Confidences are relative to the person's own best ones, as their scale differs
     between detectors. A keypoint outside the image is extrapolated and not used.
+
+    **Arguments:** `common_length`: whether people who are in few of the frames share
+    the programs of those who are in all, which then are the only ones.
 
     **Returns:** bodies in the camera frame, one β per person, present in frames
     with enough keypoints and short gaps between such frames.
@@ -91,13 +96,15 @@ def fit_bodies(
         if not present.any():
             log.warning("person %d has too few keypoints in every frame", h)
             continue
-        fitted, chain = _fit_person(
-            scene, keypoints.uv[h], sigma, present, fps, settings
-        )
+        given = scene, keypoints.uv[h], sigma, present, fps, settings
+        fitted, chain = _fit_person(*given, frames if common_length else 0)
         roots.present[h] = present
         roots.T_CH[h, fitted, :3, :3] = chain.fit.orientation
         roots.T_CH[h, fitted, :3, 3] = chain.fit.position
-        roots.body_pose[h, fitted] = _decoded(scene.prior, np.asarray(chain.fit.latent))
+        latent = np.asarray(chain.fit.latent)
+        roots.body_pose[h, fitted] = _decoded(
+            scene.prior, latent, frames if common_length else 0
+        )
         roots.T_CH[h, ~present] = np.eye(4)
         roots.body_pose[h, ~present] = 0.0
         roots.shape[h] = chain.shape[:10]
@@ -105,10 +112,11 @@ def fit_bodies(
 
 
 def _decoded(
-    prior: PosturePrior, latent: Float[np.ndarray, "t k"]
+    prior: PosturePrior, latent: Float[np.ndarray, "t k"], least: int = 0
 ) -> Float[np.ndarray, "t 23 3"]:
-    """Returns `PosturePrior.decode`, compiled for few lengths."""
-    longer = lengthened(latent, padded_length(len(latent)))
+    """Returns `PosturePrior.decode` of at least `least` frames, compiled for few
+    lengths."""
+    longer = lengthened(latent, padded_length(max(len(latent), least)))
     return np.asarray(_decode(prior, longer))[: len(latent)]
 
 
@@ -144,11 +152,13 @@ def _fit_person(
     present: np.ndarray,
     fps: float,
     settings: PeopleFit,
+    least: int = 0,
 ) -> tuple[slice, Chain]:
     """Fits one shape and the postures of all frames to one person's keypoints.
 
     `uv` is in px, the standard deviation `sigma` in m of the body, infinite for missing
-    keypoints. `present` marks the frames in which the person gets a body.
+    keypoints. `present` marks the frames in which the person gets a body. Programs are
+    those of `least` frames or more.
 
     **Returns:** the slice of frames from the first to the last present one, and the fit
     in these frames.
@@ -156,17 +166,17 @@ def _fit_person(
     where = np.flatnonzero(present)
     fitted = slice(where[0], where[-1] + 1)
     uv, sigma = uv[fitted], sigma[fitted]
-    lifted = guess_postures(scene, uv, sigma, fps, settings.lift_scale > 0)
+    lifted = guess_postures(scene, uv, sigma, fps, settings.lift_scale > 0, least)
     sigma_px = in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
     usable = np.flatnonzero(has_enough(sigma))
     start, cuts = _start(scene, uv, sigma_px, usable, lifted, fps)
 
     focal = float(scene.intrinsics[0])
-    depth = median_filter(np.asarray(start.position[:, 2]), 2 * round(fps / 4) + 1)
+    depth = median_filter(np.asarray(start.position)[:, 2], 2 * round(fps / 4) + 1)
     sigma_px = in_pixels(sigma, focal / depth)
     frames_alike = max(1.0, CORRELATION_TIME * fps)
     dtype = scene.intrinsics.dtype
-    length = padded_length(len(uv)) - len(uv)
+    length = padded_length(max(len(uv), least)) - len(uv)
     pad = lambda a, value: np.concatenate([a, np.full((length, *a.shape[1:]), value)])
     # NumPy is used because JAX would compile small programs for each length.
     last = lambda a: jnp.asarray(
@@ -198,6 +208,7 @@ def guess_postures(
     sigma: Float[np.ndarray, "t 25"],
     fps: float,
     trusted: bool = True,
+    least: int = 0,
 ) -> Lifted:
     """Returns the lifting network's posture of one person, in C.
 
@@ -205,7 +216,7 @@ def guess_postures(
     not `trusted`.
     """
     dtype = scene.intrinsics.dtype
-    length = padded_length(len(uv)) - len(uv)
+    length = padded_length(max(len(uv), least)) - len(uv)
     # Beyond the end the last frame is repeated, as the first one is before the start.
     last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
     numbers = (jnp.asarray(a, dtype) for a in (last(uv), last(sigma), fps))

@@ -13,6 +13,7 @@ from collections import deque
 import numpy as np
 from jaxtyping import Float, Int
 
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.multiview import relative_pose, resect
@@ -137,13 +138,10 @@ class LiveMap:
 
     def corrected(
         self,
-        before: Float[np.ndarray, "4 4"],
-        after: Float[np.ndarray, "4 4"],
+        move: Float[np.ndarray, "4 4"],
         points: dict[int, Float[np.ndarray, " 3"]],
     ) -> None:
-        """Moves the map so that the camera that was at `before` is at `after`; `points`
-        are where they were found to be."""
-        move = after @ np.linalg.inv(before)
+        """Moves the map as a whole; `points` are where they were found to be then."""
         turn, shift = move[:3, :3], move[:3, 3]
         self.points = {i: turn @ x + shift for i, x in self.points.items()}
         self.points.update(points)
@@ -255,5 +253,7 @@ def _pose(
     R_CW: Float[np.ndarray, "3 3"], centre: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "4 4"]:
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R_CW.T, centre
+    # Each guess is made of the last two poses: what rounding adds would be extrapolated
+    # too, and grow.
+    T[:3, :3], T[:3, 3] = so3.nearest(R_CW.T), centre
     return T

@@ -41,7 +41,7 @@ from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.lm_state import Final
 from bodyslam_jax.solver.long_tracks import lasting_spread
-from bodyslam_jax.solver.padding import pad
+from bodyslam_jax.solver.padding import first_rows, pad
 from bodyslam_jax.solver.second_order import add_second_order, curvature_of
 from bodyslam_jax.solver.selected_inverse import selected_inverse
 from bodyslam_jax.solver.solve import check_start, method_of, run
@@ -82,8 +82,12 @@ def marginals(problem: Problem, state: State) -> Marginals:
     check_start(problem, state)
     t, l = len(state.cameras), len(state.landmarks)
     spread = _differentiable(pad(problem, state), is_alone())
-    cut = {"cameras": spread.cameras[:t], "people": spread.people[:, :t]}
-    return Marginals(**{**vars(spread), **cut, "landmarks": spread.landmarks[:l]})
+    cut = {
+        "cameras": first_rows(spread.cameras, t),
+        "people": first_rows(spread.people, t, axis=1),
+        "landmarks": first_rows(spread.landmarks, l),
+    }
+    return Marginals(**{**vars(spread), **cut})
 
 
 @eqx.filter_custom_vjp

@@ -33,6 +33,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.geometry import so3
+from bodyslam_jax.geometry.lengths import put
 from bodyslam_jax.graph import (
     CHUNK,
     Factor,
@@ -121,7 +122,7 @@ def marginalise(problem: Problem, state: State, frames: int) -> Remainder:
     found = _program()(*padded, jnp.asarray(first, jnp.int32), count)
     invariant = _invariant(*padded)
     rest = _rest(problem, state, frames, observed, found.window.reach)
-    free = np.asarray(problem.free.poses[:, frames - 1]).reshape(-1, 69, 1)
+    free = np.asarray(problem.free.poses)[:, frames - 1].reshape(-1, 69, 1)
     postures = free * np.asarray(basis_of(problem, state.scale.dtype))
     prior = _prior(problem, old, rest.state, found, count, invariant, postures)
     left = (*rest.problem.factors, prior)
@@ -258,7 +259,7 @@ def _cut(x: Any, start: int, stop: int, landmarks: Bool[np.ndarray, " l"]) -> An
 
 def _rows(x: Array, at: Any) -> Array:
     """Returns `x[at]` by NumPy: JAX would compile a program for each shape."""
-    return jnp.asarray(np.asarray(x)[at])
+    return put(np.asarray(x)[at])
 
 
 def _part(
@@ -275,8 +276,8 @@ def _part(
         rows = np.flatnonzero(landmarks[landmark] & (frame >= start) & (frame < stop))
         number = np.cumsum(landmarks) - 1
         return Reprojection(
-            frame=jnp.asarray(frame[rows] - start, factor.frame.dtype),
-            landmark=jnp.asarray(number[landmark[rows]], factor.landmark.dtype),
+            frame=put(frame[rows] - start, factor.frame.dtype),
+            landmark=put(number[landmark[rows]], factor.landmark.dtype),
             pixel=_rows(factor.pixel, rows),
             sigma=_rows(factor.sigma, rows),
             loss=factor.loss,

@@ -11,7 +11,9 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
+from bodyslam_jax.geometry.lengths import put
 from bodyslam_jax.graph import (
     CHUNK,
     LandmarkPrior,
@@ -123,17 +125,22 @@ def _typed(tree):
 
 def unpad(state: State, num_frames: int, num_landmarks: int) -> State:
     """Removes the frames and landmarks that `pad` added."""
-    cut = lambda x: x if isinstance(x, jax.core.Tracer) else np.asarray(x)
     return State(
         scale=state.scale,
-        cameras=jnp.asarray(cut(state.cameras)[:num_frames]),
-        roots=jnp.asarray(cut(state.roots)[:, :num_frames]),
-        poses=jnp.asarray(cut(state.poses)[:, :num_frames]),
+        cameras=first_rows(state.cameras, num_frames),
+        roots=first_rows(state.roots, num_frames, axis=1),
+        poses=first_rows(state.poses, num_frames, axis=1),
         shapes=state.shapes,
-        landmarks=jnp.asarray(cut(state.landmarks)[:num_landmarks]),
+        landmarks=first_rows(state.landmarks, num_landmarks),
         intrinsics=state.intrinsics,
         globals=state.globals,
     )
+
+
+def first_rows(x: Array, count: int, axis: int = 0) -> Array:
+    """The first entries of an axis; outside of `jit` nothing is compiled for that."""
+    at = (slice(None),) * axis + (slice(count),)
+    return x[at] if isinstance(x, jax.core.Tracer) else put(np.asarray(x)[at])
 
 
 def _pad_factor(factor, state, frames, landmarks, observations):

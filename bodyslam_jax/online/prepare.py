@@ -1,12 +1,20 @@
-"""An invented scene, on which programs are compiled before there is a video."""
+"""All programs of a running estimate are compiled, on an invented scene, before there
+is a video."""
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax import solver
 from bodyslam_jax.body import BodyModel, local_keypoints
+from bodyslam_jax.config import Config
+from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.io.camera.calibration import project_points
-from bodyslam_jax.online.window import FRAMES, Measured
+from bodyslam_jax.online.estimate import joints_of, placed
+from bodyslam_jax.online.window import Window
+from bodyslam_jax.online.window_content import FRAMES, Measured
+from bodyslam_jax.people.filter import PersonFilter
+from bodyslam_jax.pipeline.to_metric import sole_height
 from bodyslam_jax.types import Intrinsics
 
 _POINTS = 120
@@ -14,7 +22,35 @@ _SPEED = 0.03
 """Map units a frame."""
 
 
-def invented(
+def compile_all(
+    intrinsics: Intrinsics,
+    body: BodyModel,
+    config: Config,
+    *,
+    fps: float,
+    step: float,
+    places: int,
+) -> None:
+    """Runs what an estimate runs: a window that moves on, and a person who is followed.
+
+    **Arguments:** `fps` of the video; `step` between frames of the window, s; `places`
+    for people in it.
+    """
+    frames, points = _invented(intrinsics, body, step)
+    scratch = Window(intrinsics, body, config, 1 / step, places)
+    scratch.advance(frames[: FRAMES - CHUNK])
+    scratch.advance(frames[FRAMES - CHUNK :])
+    solver.marginals(scratch.problem, scratch.state)
+    one = PersonFilter(intrinsics, body, fps, config.people_fit)
+    one.update(0.0, points, np.zeros(10))
+    one.update(1 / fps, points, np.zeros(10))
+    found = one.body()
+    placed(0, np.eye(4), found.T_CH, found.body_pose, np.zeros(10), body, None)
+    sole_height(body, np.zeros(10))
+    joints_of(body, np.zeros((FRAMES, 23, 3)), np.zeros(10))
+
+
+def _invented(
     intrinsics: Intrinsics, body: BodyModel, step: float
 ) -> tuple[list[Measured], Float[np.ndarray, "25 3"]]:
     """Frames of a camera that passes points and a person who stands, as many as let a

@@ -1,0 +1,99 @@
+"""People of a running video: who is there, what the map leaves out, and their bodies.
+
+A body is filtered from frame to frame, and begins anew where a window has solved it.
+"""
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from bodyslam_jax.body import BodyModel
+from bodyslam_jax.config import Config
+from bodyslam_jax.online.window import Solved
+from bodyslam_jax.people.filter import Body, PersonFilter
+from bodyslam_jax.people.live import LivePeople
+from bodyslam_jax.sfm.person_mask import draw_person
+from bodyslam_jax.types import Intrinsics
+
+_MARGIN = 0.06
+"""Width that is masked around people, of their height, as offline."""
+_GONE = 0.5
+"""s without keypoints after which a person is not in the estimate."""
+_MEAN = np.zeros(10)
+"""β of somebody of whom no window knows."""
+
+
+class LiveBodies:
+    """People by their numbers, their filters, and which feet stand."""
+
+    def __init__(self, config: Config, body: BodyModel, fps: float) -> None:
+        self.config, self.body, self.fps = config, body, fps
+        self.found = LivePeople(fps, config.detection, config.association)
+        self.filters: dict[int, PersonFilter] = {}
+        self.last_seen: dict[int, float] = {}
+        self.contacts: dict[int, Float[np.ndarray, " 4"]] = {}
+        """As the last window has them, in the person's last frame there."""
+
+    def find(
+        self,
+        image: UInt8[np.ndarray, "y x 3"] | None,
+        keypoints: Float[np.ndarray, "p 25 3"] | None,
+    ) -> dict[int, Float[np.ndarray, "25 3"]]:
+        """Keypoints (u px, v px, confidence) in the next frame, by person: those given,
+        or else as the networks find them."""
+        if not self.config.people:
+            return {}
+        if keypoints is not None:
+            return self.found.given(np.asarray(keypoints, float), image)
+        if image is None or self.config.detect == "none":
+            return {}
+        return self.found.find(image)
+
+    def mask(
+        self, people: dict[int, np.ndarray], intrinsics: Intrinsics
+    ) -> UInt8[np.ndarray, "y x"] | None:
+        """Not 0 where people are; `None` without anybody."""
+        if not people:
+            return None
+        mask = np.zeros((intrinsics.height, intrinsics.width), np.uint8)
+        for points in people.values():
+            draw_person(mask, points, _MARGIN)
+        return mask
+
+    def follow(
+        self,
+        timestamp: float,
+        people: dict[int, np.ndarray],
+        intrinsics: Intrinsics,
+        shapes: dict[int, np.ndarray],
+    ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """T_CH and θ of everybody who is here or was half a second ago; `shapes` are
+        those that windows know."""
+        found = {}
+        for person in people:
+            if person not in self.filters:
+                self.filters[person] = PersonFilter(
+                    intrinsics, self.body, self.fps, self.config.people_fit
+                )
+            self.last_seen[person] = timestamp
+        for person, one in list(self.filters.items()):
+            if timestamp - self.last_seen[person] > _GONE:
+                del self.filters[person]
+                self.contacts.pop(person, None)
+                continue
+            points = people.get(person, np.zeros((25, 3)))
+            body = one.update(timestamp, points, shapes.get(person, _MEAN))
+            if body is not None:
+                found[person] = body.T_CH, body.body_pose
+        return found
+
+    def learn(self, solved: Solved, shapes: dict[int, np.ndarray]) -> None:
+        """Takes contacts and newest bodies from a window."""
+        for h, person in enumerate(solved.people):
+            if person is None or not solved.present[h].any():
+                continue
+            last = int(np.flatnonzero(solved.present[h])[-1])
+            self.contacts[person] = solved.contacts[h, last]
+            if person in self.filters:
+                body = Body(solved.roots[h, last], solved.poses[h, last])
+                at = float(solved.times[last])
+                self.filters[person].anchor(at, body, shapes.get(person, _MEAN))

@@ -1,0 +1,316 @@
+"""The graph's problem over what is in the window.
+
+All arrays have one size, so that the solver's programs are compiled once. A factor that
+counts one error once for a whole clip (steps, the ground) gets here what its
+information grows by.
+"""
+
+import dataclasses
+import logging
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from bodyslam_jax import graph, initialisation, people
+from bodyslam_jax.geometry.lengths import put
+from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
+from bodyslam_jax.graph import CHUNK
+from bodyslam_jax.io.camera.calibration import as_opencv, rays
+from bodyslam_jax.motion import Prediction
+from bodyslam_jax.online import prior as priors
+from bodyslam_jax.online.window_content import FRAMES, PRIOR, Content
+from bodyslam_jax.people import PersonState
+from bodyslam_jax.pipeline.motion_prediction import (
+    contact_predictor,
+    motion_predictor,
+    predict,
+)
+from bodyslam_jax.solver.marginalisation import in_frames
+from bodyslam_jax.types import Keypoints, ScaleStart, Sequence, Tracks
+
+log = logging.getLogger(__name__)
+
+_LEAST_ANGLE = np.radians(0.5)
+"""Parallax from which a landmark is in the graph: ten times the noise of a ray."""
+_LEAST_SEEN = 3
+"""Observations of a landmark in the graph."""
+_OUTLIER = 6.0
+"""Reprojection error of a landmark's median observation from which it is left out, in
+its standard deviation."""
+_LEAST_STEPS = 15
+"""Predicted steps from which s is estimated: about a second."""
+_GROUND_COUNTS = 10.0
+"""Frames with ground that count half as much as all of them."""
+_DEFINITION = "unknown"
+"""What the detector calls a hip or a knee (`Keypoints.definition`)."""
+_NOWHERE = np.full(3, np.nan)
+_ROOM = 540
+"""Landmarks that the tables of a window hold, partly filled as they are."""
+_VARIABLES = ("scale", "cameras", "roots", "poses", "shapes", "landmarks")
+
+
+def start(
+    window: Content,
+) -> tuple[Sequence, graph.State, PersonState]:
+    """The window as a sequence, the first state of its solve, and people's bodies
+    as fitted to their keypoints alone."""
+    keypoints = Keypoints(window.uv, window.confidence, _DEFINITION)
+    sequence = Sequence(
+        name="window",
+        frames=None,
+        # Even times: the motion model's programs depend on how they lie.
+        timestamps=np.arange(FRAMES) / window.fps,
+        intrinsics=window.intrinsics,
+        keypoints=keypoints,
+    )
+    given = keypoints, window.intrinsics, window.body, window.fps
+    settings = window.config.people_fit
+    bodies = people.fit_bodies(*given, settings, common_length=True)
+    roots = people.roots_from_bodies(bodies, window.body)
+    for h in range(window.places):
+        _start_person(window, h, roots)
+    state = graph.State(
+        scale=jnp.asarray(window.scale, float),
+        cameras=jnp.asarray(window.cameras),
+        roots=jnp.asarray(window.roots),
+        poses=jnp.asarray(window.poses),
+        shapes=jnp.asarray(window.shapes),
+        landmarks=jnp.zeros((0, 3)),
+        intrinsics=jnp.asarray(window.intrinsics.params, float),
+    )
+    return sequence, state, roots
+
+
+def _start_person(window: Content, h: int, roots: PersonState) -> None:
+    """Frames of a person that no solve has moved start at the fit."""
+    there = roots.present[h]
+    there[: CHUNK - 1] &= window.known[h, : CHUNK - 1]
+    new = there & ~window.known[h]
+    if not new.any():
+        return
+    if window.began[h] < 0:
+        window.began[h] = window.first + int(np.argmax(there))
+    if window.people[h] not in window.book and not window.known[h].any():
+        window.shapes[h] = roots.shape[h]
+    # A fit of another stature stands at another distance.
+    both = np.flatnonzero(there & window.known[h])[-CHUNK:]
+    ratio = 1.0
+    if len(both):
+        depths = (x[h, both, 2, 3] for x in (window.roots, roots.T_CH))
+        ratio = float(np.median(np.divide(*depths)))
+    window.roots[h, new] = roots.T_CH[h, new]
+    window.roots[h, new, :3, 3] *= ratio
+    window.poses[h, new] = roots.body_pose[h, new]
+
+
+def make(
+    window: Content, sequence: Sequence, state: graph.State, roots: PersonState
+) -> tuple[graph.Problem, graph.State, np.ndarray]:
+    weights = window.config.weights
+    measured = np.arange(FRAMES) >= CHUNK
+    tracks, places = _tracks(window)
+    state = eqx.tree_at(lambda s: s.landmarks, state, put(places))
+    sigma = initialisation.landmark_sigma(window.pixel_sigma, weights)
+    cameras = initialisation.map_factor(
+        tracks, np.ones(len(tracks.frame), bool), sigma, weights
+    )
+    of_people = [
+        _shape_once(window, f, roots) if isinstance(f, graph.ShapePrior) else f
+        for f in initialisation.people_factors(sequence, roots, weights, window.body)
+    ]
+    if window.predictor is None:
+        given = sequence, roots, window.body, window.config
+        window.predictor = motion_predictor(*given)
+        window.stands = contact_predictor(*given)
+    located = window.located | (np.arange(FRAMES) < CHUNK)
+    predictor = dataclasses.replace(
+        window.predictor, present=jnp.asarray(roots.present & located)
+    )
+    prediction = predict(predictor, state)
+    legs = people.legs_shown(
+        people.shown_keypoints(sequence, window.body), roots.present, window.fps
+    )
+    steps = initialisation.steps_shown(prediction, legs, window.fps)
+    moved = initialisation.motion_factor(
+        steps, state.shapes, window.body, weights, shared_error=0.0
+    )
+    moved, told = _steps_once(window, moved, measured)
+    ground, state = _ground(window, sequence, state, roots, legs, steps, measured)
+    factors = [*of_people, moved, ground]
+    factors = [cameras, *(in_frames(f, measured) for f in factors)]
+    if window.prior is None:
+        nothing = priors.no_prior(state, PRIOR, 2)
+        window.prior = priors.with_scale(nothing, window.scale_sigma)
+    metric = np.isfinite(window.scale_sigma) or bool((told > 0).any())
+    free = dataclasses.replace(state, landmarks=put(places[:0])).zero_step()
+    ones = lambda x, mask: jnp.ones_like(x) * jnp.asarray(mask, x.dtype)
+    past = np.asarray(np.arange(FRAMES) >= CHUNK - window.prior.reach)
+    last = np.asarray(np.arange(FRAMES) >= CHUNK - 1)
+    filled = np.arange(FRAMES) < CHUNK + window.count
+    there = roots.present & filled
+    free = dataclasses.replace(
+        free,
+        scale=ones(free.scale, float(metric)),
+        cameras=jnp.asarray(window.free * past[:, None]),
+        roots=ones(free.roots, (there & past)[..., None]),
+        poses=ones(free.poses, (there & last)[..., None, None]),
+        shapes=ones(free.shapes, np.asarray(there.any(axis=1))[:, None]),
+        landmarks=put(np.ones(places.shape)),
+    )
+    problem = graph.make_problem(
+        [*factors, window.prior],
+        state,
+        motion=predictor,
+        free=free,
+        common_sizes=True,
+        basis=people.posture_basis(),
+    )
+    variables = tuple(v for v in graph.VARIABLES if v in _VARIABLES)
+    problem = dataclasses.replace(problem, variables=variables)
+    if problem.layout.num_chunks != FRAMES // CHUNK:
+        log.warning("a window's landmarks fit in no table of its size")
+    return problem, state, told if metric else told[:0]
+
+
+def _tracks(
+    window: Content,
+) -> tuple[Tracks, Float[np.ndarray, "l 3"]]:
+    """Observations of the landmarks that are in the graph, and their places."""
+    frame = np.concatenate([np.full(len(s[0]), k) for k, s in enumerate(window.seen)])
+    landmark = np.concatenate([s[0] for s in window.seen]).astype(int)
+    uv = np.concatenate([s[1] for s in window.seen])
+    known, row, seen = np.unique(landmark, return_inverse=True, return_counts=True)
+    R_CW = np.swapaxes(window.cameras[:, :3, :3], 1, 2)[frame]
+    centre = window.cameras[frame, :3, 3]
+    K, distortion = as_opencv(window.intrinsics.params)
+    xy = rays(uv, K, distortion)
+    pixel = 1 / K[0, 0]
+    places = np.array([window.where.get(i, _NOWHERE) for i in known.tolist()])
+    places = places.reshape(-1, 3)
+    fresh = np.asarray(np.isnan(places).any(axis=1))
+    if fresh.any():
+        found = triangulate(R_CW, centre, xy, row, len(known), pixel)
+        places = np.where(fresh[:, None], found, places)
+    p_C = np.einsum("mij,mj->mi", R_CW, places[row] - centre)
+    depth = p_C[:, 2]
+    front = depth > 1e-6
+    away = np.linalg.norm(
+        p_C[:, :2] / np.where(front, depth, 1.0)[:, None] - xy, axis=1
+    )
+    limit = _OUTLIER * window.pixel_sigma * pixel
+    off = np.bincount(row, np.logical_or(~front, away > limit), len(known)) / seen
+    good = (seen >= _LEAST_SEEN) & (off < 0.5)
+    good &= widest_angle(centre, row, places) > _LEAST_ANGLE
+    for i in known[~good]:
+        window.where.pop(int(i), None)
+    good = _most(good, seen, _ROOM)
+    rows = np.flatnonzero(good[row])
+    number = np.cumsum(good) - 1
+    window.in_graph = known[good]
+    return Tracks(frame[rows], number[row[rows]], uv[rows]), places[good]
+
+
+def _shape_once(
+    window: Content, factor: graph.ShapePrior, roots: PersonState
+) -> graph.ShapePrior:
+    """One measurement of each person's shape: the fit in their first frame here, or
+    what the book has of them."""
+    sigma = np.full(np.shape(factor.sigma), np.inf)
+    shape = np.array(factor.shape)
+    for h, person in enumerate(window.people):
+        k = window.began[h] - window.first
+        if person is None or not 0 <= k < FRAMES or not roots.present[h].any():
+            continue
+        mean, known = window.book.get(
+            person, (roots.shape[h], window.config.weights.shape_sigma)
+        )
+        shape[h], sigma[h, k] = mean, known
+    return eqx.tree_at(
+        lambda f: (f.shape, f.sigma),
+        factor,
+        (jnp.asarray(shape), jnp.asarray(sigma)),
+    )
+
+
+def _steps_once(
+    window: Content, moved: graph.HumanMotion, measured: np.ndarray
+) -> tuple[graph.HumanMotion, Float[np.ndarray, "h t"]]:
+    """Steps with the weight by which they add to those before.
+
+    With an error e common to all steps, information I on their factor is worth
+    `I / (1 + e² I)`. What it grows by from I_0 to I_0 + I is the weight
+    `1 / ((1 + e² I_0) (1 + e² (I_0 + I)))` of I.
+
+    **Returns:** the information of each frame, too.
+    """
+    weights = window.config.weights
+    whitening = np.array(moved.whitening)
+    step = np.asarray(moved.translation)
+    rho = weights.motion_correlation
+    told = ((whitening @ step[..., None])[..., 0] ** 2).sum(-1)
+    told = told * (1 - rho) / (1 + rho) * measured
+    squared = weights.fitted_step_error**2
+    before = 1 + squared * window.steps_told
+    after = before + squared * told.sum(axis=1)
+    whitening *= (before * after)[:, None, None, None] ** -0.5
+    moved = eqx.tree_at(lambda f: f.whitening, moved, jnp.asarray(whitening))
+    return moved, told
+
+
+def _ground(
+    window: Content,
+    sequence: Sequence,
+    state: graph.State,
+    roots: PersonState,
+    legs: np.ndarray,
+    steps: Prediction,
+    measured: np.ndarray,
+) -> tuple[graph.GroundContact, graph.State]:
+    """The factor of people on the ground of the map, and the state with a first
+    scale if it has none yet and there is something that tells it."""
+    weights = window.config.weights
+    blank = graph.GroundContact(
+        window.body,
+        jnp.asarray([0.0, -1.0, 0.0]),
+        jnp.zeros((window.places, FRAMES)),
+        jnp.full((window.places, FRAMES), jnp.inf),
+    )
+    present = roots.present & window.located & legs & measured
+    contact = None
+    if present.sum() >= CHUNK:
+        contact = initialisation.ground_contact(
+            state, present, sequence.keypoints, window.body, weights, window.fps
+        )
+    if contact is not None:
+        contact = initialisation.with_wander(contact, state, window.fps)
+    if np.isnan(window.scale_sigma):
+        start = ScaleStart()
+        if np.asarray(steps.valid)[:, CHUNK:].sum() >= _LEAST_STEPS:
+            start = initialisation.scale_start(
+                state, steps, contact, shared_error=weights.fitted_step_error
+            )
+        if np.isfinite(start.standard_error) and start.value > 0:
+            scale = jnp.asarray(start.value, state.scale.dtype)
+            state = eqx.tree_at(lambda s: s.scale, state, scale)
+    if contact is None:
+        return blank, state
+    sigma = np.asarray(contact.sigma)
+    used = np.isfinite(sigma)
+    count, told = float(used.sum()), window.ground_told
+    share = lambda n: n / (_GROUND_COUNTS + n)
+    grown = max(share(told + count) - share(told), 1e-9)
+    # `sigma` is that of all frames together times the root of their number.
+    sigma = sigma / np.sqrt(count) * np.sqrt(count / grown)
+    return eqx.tree_at(lambda f: f.sigma, contact, jnp.asarray(sigma)), state
+
+
+def _most(good: np.ndarray, seen: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the good ones, those that are seen most."""
+    if good.sum() <= most:
+        return good
+    order = np.argsort(np.where(good, -seen, 0), kind="stable")
+    kept = np.zeros(len(good), bool)
+    kept[order[:most]] = True
+    return kept & good
