@@ -288,9 +288,10 @@ def clip_row(video: Path) -> Row:
     people."""
     import jax.numpy as jnp
 
-    from bodyslam_jax import evaluation, io, pipeline
+    from bodyslam_jax import io, pipeline
     from bodyslam_jax.body.skeleton import NECK, PELVIS
     from bodyslam_jax.config import Config
+    from bodyslam_jax.evaluation.plausibility import posture_figures
 
     config = Config(overlay=False)
     sequence = pipeline.find_people(io.read_sequence(video), config)
@@ -299,7 +300,7 @@ def clip_row(video: Path) -> Row:
     up = jnp.array([0.0, 1.0, 0.0])
     rows = []
     for joints, present in zip(result.joints, result.present):
-        found = evaluation.posture_figures(
+        found = posture_figures(
             jnp.asarray(joints), jnp.asarray(present), up, jnp.asarray(fps)
         )
         trunk = (joints[:, NECK] - joints[:, PELVIS])[present]
