@@ -65,10 +65,9 @@ def test_a_camera_that_does_not_zoom_is_left_as_it_is(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "family"), [("D1", "room"), ("E1", "follow")])
-def test_a_long_walk_is_no_zoom(name, family):
+def test_a_long_walk_is_no_zoom():
     """Over hundreds of frames pairs were found that a rotation and a zoom explain."""
-    walk = simulation.simulate(Simulation(sequence=name, family=family))
+    walk = simulation.simulate(Simulation(sequence="D1", family="room"))
     sequence = simulation.as_sequence(walk)
     model = find_camera_model(
         sequence.tracks, sequence.intrinsics, sequence.num_frames, Structure()
