@@ -279,6 +279,15 @@ def test_opensim_has_the_same_markers_in_model_data_and_tasks(tmp_path, result, 
         bone = result.joints[1, there, joint] - result.joints[1, there, PARENTS[joint]]
         length = np.linalg.norm(bone, axis=-1)
         np.testing.assert_allclose(np.linalg.norm(found[name]), length, rtol=1e-5)
+    # A positive coordinate swings the limb forwards (x), or the shin backwards.
+    axes = {axis.findtext("coordinates"): axis for axis in model.iter("TransformAxis")}
+    for name, marker, ahead in (
+        ("hip_flexion_r", "right_knee", 1),
+        ("knee_angle_l", "left_ankle", -1),
+        ("arm_flex_l", "left_elbow", 1),
+    ):
+        about = np.array(axes[name].findtext("axis", "").split(), float)
+        assert np.cross(about, found[marker])[0] * ahead > 0.1, name
     # What the model has between markers of a segment, the data have in every frame.
     for a, b in (("left_ankle", "tibia_l_front"), ("humerus_r_right", "right_elbow")):
         between = np.linalg.norm(at[a] - at[b], axis=-1)

@@ -68,13 +68,19 @@ class Segment:
     right)."""
 
 
+def _of_side(side: str, *axes: tuple[str, Axis]) -> tuple[tuple[str, Axis], ...]:
+    """Returns coordinates with the suffix of their side, `r` or `l`."""
+    return tuple((f"{name}_{side}", axis) for name, axis in axes)
+
+
 def _leg(side: str, hip: int, outward: bool) -> list[Segment]:
     x, y = (_MINUS_X, _MINUS_Y) if outward else (_X, _Y)
     knee, ankle, foot = hip + 3, hip + 6, hip + 9
-    named = lambda *pairs: tuple((f"{name}_{side}", axis) for name, axis in pairs)
-    hips = named(("hip_flexion", _Z), ("hip_adduction", x), ("hip_rotation", y))
-    ankles = named(("ankle_angle", _Z), ("subtalar_angle", x))
-    bend = named(("knee_angle", _MINUS_Z))
+    hips = _of_side(
+        side, ("hip_flexion", _Z), ("hip_adduction", x), ("hip_rotation", y)
+    )
+    ankles = _of_side(side, ("ankle_angle", _Z), ("subtalar_angle", x))
+    bend = _of_side(side, ("knee_angle", _MINUS_Z))
     femur, tibia = f"femur_{side}", f"tibia_{side}"
     return [
         Segment(femur, "pelvis", hip, hip, hips, (knee,)),
@@ -86,10 +92,9 @@ def _leg(side: str, hip: int, outward: bool) -> list[Segment]:
 def _arm(side: str, shoulder: int, outward: bool) -> list[Segment]:
     x, y = (_MINUS_X, _MINUS_Y) if outward else (_X, _Y)
     elbow, wrist, hand = shoulder + 2, shoulder + 4, shoulder + 6
-    named = lambda *pairs: tuple((f"{name}_{side}", axis) for name, axis in pairs)
-    shoulders = named(("arm_flex", _Z), ("arm_add", x), ("arm_rot", y))
-    elbows = named(("elbow_flex", _Z), ("pro_sup", y))
-    wrists = named(("wrist_flex", _Z), ("wrist_dev", x))
+    shoulders = _of_side(side, ("arm_flex", _Z), ("arm_add", x), ("arm_rot", y))
+    elbows = _of_side(side, ("elbow_flex", _Z), ("pro_sup", y))
+    wrists = _of_side(side, ("wrist_flex", _Z), ("wrist_dev", x))
     humerus, forearm, down = f"humerus_{side}", f"forearm_{side}", _ARM_ROTATIONS[side]
     return [
         Segment(humerus, "torso", shoulder, shoulder, shoulders, (elbow,), down),
