@@ -89,7 +89,7 @@ COMMANDS = {
     "doctor": _command(doctor),
     "completion": _command(completion),
 }
-"""By name; commands of one group share the first word."""
+"""All commands by name; commands of one group share the first word."""
 GROUPS = {
     "body-model": "Body model files: SMPL and models of its shape, SMPL-H, SMPL-X.",
     "convert-dataset": "Sequence folders with ground truth, made from datasets.",

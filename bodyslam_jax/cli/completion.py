@@ -24,7 +24,7 @@ def completion(shell: tyro.conf.Positional[Shell], /) -> None:
 
 
 def script(shell: Shell) -> str:
-    """The completion script of a shell."""
+    """Returns the completion script of a shell."""
     if shell == "fish":
         return "\n".join(_fish()) + "\n"
     bash = "\n".join(_bash()) + "\n"
@@ -37,7 +37,7 @@ def script(shell: Shell) -> str:
 
 
 def _flags() -> dict[str, list[tuple[str, str]]]:
-    """Flags and their descriptions, by command."""
+    """Returns flags and their descriptions, by command."""
     from bodyslam_jax.cli.commands import COMMANDS
 
     return {
@@ -50,7 +50,8 @@ def _flags() -> dict[str, list[tuple[str, str]]]:
 
 
 def _words() -> dict[str, list[str]]:
-    """Words that may follow each incomplete command; of groups, their commands."""
+    """Returns the words that may follow each incomplete command: for a group, its
+    commands."""
     found: dict[str, list[str]] = {"": []}
     for name in _flags():
         first, _, second = name.partition(" ")

@@ -25,14 +25,15 @@ def doctor() -> None:
 
 
 def report() -> list[tuple[str, str]]:
-    """Rows of `(name, finding)`; does not raise if something is missing."""
+    """Returns rows of `(name, finding)`; a missing part is a finding, not an error."""
     rows = [("python", f"{platform.python_version()} on {platform.platform()}")]
     rows += [(name, _version(name)) for name in _PACKAGES]
     return rows + _devices() + _opencv() + _networks() + _models()
 
 
 def verdict(rows: list[tuple[str, str]]) -> str:
-    """What works on a machine of which `report` says `rows`, and what does not."""
+    """Returns a sentence that says what works on the machine that the `rows` of
+    `report` describe, and what does not."""
     found = dict(rows)
     missing = [name for name in _PACKAGES if found[name] == NOT_INSTALLED]
     if missing:

@@ -1,4 +1,4 @@
-"""Where a run goes that names no folder, and how to look at a finished one."""
+"""Default output folder of `run`, and the command that opens the report of a run."""
 
 import itertools
 import shlex
@@ -13,7 +13,7 @@ _OPENERS = {"darwin": "open", "win32": "start"}
 
 
 def default_folder(sequence: Sequence) -> Path:
-    """`runs/NAME`, or `runs/NAME-2` and so on where an earlier run is finished.
+    """Returns `runs/NAME`, or `runs/NAME-2` and so on where an earlier run is finished.
 
     An unfinished run of the same input is continued.
     """
@@ -24,8 +24,8 @@ def default_folder(sequence: Sequence) -> Path:
 def free_folder(
     name: str, is_ours: Callable[[Path], bool] = lambda folder: False
 ) -> Path:
-    """`runs/NAME`, or the first of `runs/NAME-2` and so on that is not there, or
-    `is_ours`."""
+    """Returns the first of `runs/NAME`, `runs/NAME-2` and so on that does not exist or
+    for which `is_ours` is true."""
     for number in itertools.count(1):
         folder = _ROOT / (name if number == 1 else f"{name}-{number}")
         if not folder.exists() or is_ours(folder):
@@ -34,7 +34,7 @@ def free_folder(
 
 
 def look_at(folder: Path) -> str:
-    """The command that opens a run's report."""
+    """Returns the command that opens a run's report."""
     opener = _OPENERS.get(sys.platform, "xdg-open")
     return f"{opener} {shlex.quote(str(folder / 'report.html'))}"
 

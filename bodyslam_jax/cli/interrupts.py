@@ -40,15 +40,15 @@ def install() -> None:
 
 
 def arrived() -> bool:
-    """Whether this process was interrupted, whatever became of `KeyboardInterrupt`:
-    the import of a compiled module replaces it by an error of its own."""
+    """Returns True if this process was interrupted, even where `KeyboardInterrupt` was
+    lost: the import of a compiled module replaces it by an error of its own."""
     return _ARRIVED.is_set()
 
 
 @contextlib.contextmanager
 def deferred() -> Iterator[None]:
-    """Raises `KeyboardInterrupt` at the end of the block only: raised while jaxlib is
-    being imported, it crashes Python."""
+    """Delays `KeyboardInterrupt` to the end of the block: raised while jaxlib is being
+    imported, it crashes Python."""
     handler = signal.getsignal(signal.SIGINT)
     if not callable(handler):
         yield
@@ -65,8 +65,8 @@ def deferred() -> Iterator[None]:
 
 @contextlib.contextmanager
 def as_event() -> Iterator[threading.Event]:
-    """The first Ctrl-C in the block sets an event and nothing else; the next one is
-    handled as outside of it."""
+    """Yields an event that the first Ctrl-C in the block sets, without any other
+    effect; the next one is handled as outside of the block."""
     event = threading.Event()
     handler = signal.getsignal(signal.SIGINT)
     if not callable(handler):  # ignored, as by `nohup`

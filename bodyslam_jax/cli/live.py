@@ -15,12 +15,13 @@ from bodyslam_jax.config import Config
 
 log = logging.getLogger(__name__)
 
-_SILENT, _GIVEN_UP = 5.0, 30.0
-"""s without an image after which that is told, and after which the source has ended."""
-_SHOWN_EVERY = 0.1
-"""Least s between two pictures on the page."""
-_TOLD_EVERY = 5.0
-"""s between two lines of progress."""
+_SILENCE_WARNING_S, _MAX_SILENCE_S = 5.0, 30.0
+"""Time without an image, s, after which there is a warning, and after which the source
+has ended."""
+_PICTURE_INTERVAL_S = 0.1
+"""Least time between two pictures on the page, s."""
+_PROGRESS_INTERVAL_S = 5.0
+"""Time between two lines of progress, s."""
 
 
 def live(
@@ -119,7 +120,7 @@ def _write_folder(online: Any, result: Any, out: Path) -> None:
 
 
 def _check(config: Config) -> None:
-    """Refuses what is known of a whole video only.
+    """Refuses settings that describe a whole video, which does not exist yet.
 
     **Raises:** `InputError` that names the option.
     """
@@ -145,7 +146,8 @@ def _page(wanted: bool, port: int, open: bool) -> Any:
 
 
 def _follow(capture: Any, online: Any, page: Any, stop: Any) -> list[int]:
-    """Takes images in until the source or the user ends it; the numbers of these."""
+    """Passes images to the estimate until the source ends or the user stops it; returns
+    the numbers of these images in the source."""
     indices: list[int] = []
     latencies: list[float] = []
     told, drawn, begun = 0.0, 0.0, time.monotonic()
@@ -157,11 +159,13 @@ def _follow(capture: Any, online: Any, page: Any, stop: Any) -> list[int]:
         if found is None:
             if capture.ended:
                 break
-            if capture.silent() > _SILENT and not silent:
+            if capture.silent() > _SILENCE_WARNING_S and not silent:
                 silent = True
-                log.warning("%s: no image for %.0f s", capture.source, _SILENT)
-            if capture.silent() > _GIVEN_UP:
-                online.warn(f"the source gave no image for {_GIVEN_UP:.0f} s")
+                log.warning(
+                    "%s: no image for %.0f s", capture.source, _SILENCE_WARNING_S
+                )
+            if capture.silent() > _MAX_SILENCE_S:
+                online.warn(f"the source gave no image for {_MAX_SILENCE_S:.0f} s")
                 break
             continue
         silent = False
@@ -171,7 +175,7 @@ def _follow(capture: Any, online: Any, page: Any, stop: Any) -> list[int]:
         late = sorted(latencies)[int(0.95 * (len(latencies) - 1))]
         rate = len(indices) / max(now - begun, 1e-9)
         figures = _figures(estimate, rate, late, capture.dropped)
-        if page is not None and now - drawn >= _SHOWN_EVERY:
+        if page is not None and now - drawn >= _PICTURE_INTERVAL_S:
             drawn = now
             page.show(
                 found.image,
@@ -180,7 +184,7 @@ def _follow(capture: Any, online: Any, page: Any, stop: Any) -> list[int]:
                 estimate.T_WC,
                 {"figures": figures, "notes": estimate.notes},
             )
-        if now - told >= _TOLD_EVERY:
+        if now - told >= _PROGRESS_INTERVAL_S:
             told = now
             log.info(", ".join(f"{k} {v}" for k, v in figures.items()))
     return indices
@@ -204,7 +208,7 @@ def _figures(estimate: Any, rate: float, late: float, dropped: int) -> dict[str,
 
 
 def _name(source: str) -> str:
-    """What the run is called."""
+    """Returns the name of the run of a source."""
     path = Path(source)
     if path.is_file():
         return path.stem

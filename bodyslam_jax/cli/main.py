@@ -66,7 +66,7 @@ def main() -> NoReturn:
 
 
 def program() -> NoReturn:
-    """`main` as a process of its own, with its handling of signals."""
+    """Runs `main` as a process of its own, with its handling of signals."""
     interrupts.install()
     try:
         main()
@@ -104,7 +104,7 @@ def _dispatch(argv: list[str]) -> int | None:
 
 
 def _command(argv: list[str]) -> tuple[str, list[str]]:
-    """The command or group that `argv` names, and its arguments.
+    """Returns the command or group that `argv` names, and its arguments.
 
     **Raises:** `WrongUsage`, which suggests the closest name, if there is no such
     command.

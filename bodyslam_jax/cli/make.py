@@ -85,7 +85,8 @@ def train_motion(
 
 @contextlib.contextmanager
 def _progress() -> Iterator[Callable[[int, int, dict[str, float]], None]]:
-    """A bar on a terminal, a line an epoch in a file."""
+    """Yields a function that reports epochs: as a bar on a terminal, else as a log line
+    per epoch."""
     from rich import console, progress
 
     terminal = console.Console(stderr=True)

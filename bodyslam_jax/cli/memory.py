@@ -8,12 +8,12 @@ twice the memory.
 import ctypes
 import platform
 
-_COMPILED = "/jax/core/compile/backend_compile_duration"
-_LEAST = 0.5
+_COMPILATION_EVENT = "/jax/core/compile/backend_compile_duration"
+_MIN_COMPILATION_S = 0.5
 """Compilations shorter than this free little memory, s."""
 _MMAP_THRESHOLD = -3
 """`M_MMAP_THRESHOLD` of `malloc.h`."""
-_LARGE = 1 << 20
+_MIN_MMAP_BYTES = 1 << 20
 """Size from which arrays have pages of their own, bytes."""
 
 
@@ -24,10 +24,10 @@ def return_memory() -> None:
     import jax
 
     library = ctypes.CDLL(None)
-    library.mallopt(_MMAP_THRESHOLD, _LARGE)
+    library.mallopt(_MMAP_THRESHOLD, _MIN_MMAP_BYTES)
 
     def trim(event: str, duration_secs: float, **_: object) -> None:
-        if event == _COMPILED and duration_secs > _LEAST:
+        if event == _COMPILATION_EVENT and duration_secs > _MIN_COMPILATION_S:
             library.malloc_trim(0)
 
     jax.monitoring.register_event_duration_secs_listener(trim)

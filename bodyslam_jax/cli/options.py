@@ -53,7 +53,8 @@ class Option:
 
     @property
     def flags(self) -> list[str]:
-        """The option as it is typed, and for a switch the form that turns it off."""
+        """Returns the option as it is typed, and for a switch the form that turns it
+        off."""
         if self.is_positional:
             return []
         stage, dot, name = self.name.replace("_", "-").rpartition(".")
@@ -62,7 +63,7 @@ class Option:
 
     @property
     def usage(self) -> str:
-        """As help shows it."""
+        """Returns the option with its value, as help shows it."""
         if self.is_positional:
             return self.value or ""
         if self.value:
@@ -72,7 +73,7 @@ class Option:
 
 
 def options(function: Callable[..., Any]) -> list[Option]:
-    """The options of a command, in the order of its signature."""
+    """Returns the options of a command, in the order of its signature."""
     about = _arguments_described(inspect.getdoc(function) or "")
     hints = typing.get_type_hints(function)
     found = []
@@ -96,7 +97,7 @@ def options(function: Callable[..., Any]) -> list[Option]:
 
 
 def suggestions(wrong: str, flags: dict[str, list[str]], command: str) -> str:
-    """A hint for a user who typed the unknown option `wrong` after `command`.
+    """Returns a hint for a user who typed the unknown option `wrong` after `command`.
 
     Args:
         flags: the options of every command, by the command's name.
@@ -115,7 +116,7 @@ def suggestions(wrong: str, flags: dict[str, list[str]], command: str) -> str:
 
 
 def settings_described(kind: type) -> dict[str, str]:
-    """The description of each field of a dataclass, by the field's name.
+    """Returns the description of each field of a dataclass, by the field's name.
 
     A description is the string literal below the field in the source. Inherited fields
     are included.
@@ -172,7 +173,7 @@ def _value(kind: Any) -> str:
 
 
 def _arguments_described(docstring: str) -> dict[str, str]:
-    """The descriptions in the section `Args:` of a docstring, by argument."""
+    """Returns the descriptions in the section `Args:` of a docstring, by argument."""
     found, name = {}, ""
     for line in docstring.partition("Args:\n")[2].splitlines():
         if line.startswith("        "):

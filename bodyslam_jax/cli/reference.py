@@ -14,13 +14,13 @@ Recovers camera path, people and a map, in metres, from a video that one moving 
 took of people."""
 START = """\
 Without any file: `bodyslam demo`. With your own video: `bodyslam run VIDEO.mp4`."""
-_WIDEST = 88
-_COLUMN = 26
-"""Where descriptions start."""
+_MAX_WIDTH = 88
+_DESCRIPTION_COLUMN = 26
+"""Column in which descriptions start."""
 
 
 def overview(group: str | None = None) -> str:
-    """The commands, or those of a group, one a line."""
+    """Returns the commands, or those of a group, one a line."""
     width = _width()
     lines = [GROUPS[group] if group else f"{_fill(ABOUT, width)}\n\n{START}", ""]
     prog = f"bodyslam {group} " if group else "bodyslam "
@@ -34,7 +34,7 @@ def overview(group: str | None = None) -> str:
 
 
 def command_help(name: str, everything: bool) -> str:
-    """What `--help` and `--help-all` print of a command."""
+    """Returns what `--help` and `--help-all` print of a command."""
     command, width = COMMANDS[name], _width()
     found = options(command.function)
     shown = [
@@ -66,7 +66,7 @@ def command_help(name: str, everything: bool) -> str:
 
 
 def reference() -> str:
-    """`docs/cli.md`: all commands with all options, defaults and units."""
+    """Returns `docs/cli.md`: all commands with all options, defaults and units."""
     parts = [
         "# Command line",
         "Made by `python tools/make_cli_docs.py` from the code.",
@@ -99,7 +99,7 @@ def reference() -> str:
 
 
 def _listed(group: str | None) -> Iterable[tuple[str, str]]:
-    """Names and first sentences; groups among the commands."""
+    """Returns names and first sentences of commands; groups are among the commands."""
     if group:
         for name, command in COMMANDS.items():
             if name.startswith(f"{group} "):
@@ -141,7 +141,7 @@ def _first_line(function: Callable[..., Any]) -> str:
 
 
 def _width() -> int:
-    return min(_WIDEST, shutil.get_terminal_size((_WIDEST, 24)).columns)
+    return min(_MAX_WIDTH, shutil.get_terminal_size((_MAX_WIDTH, 24)).columns)
 
 
 def _fill(text: str, width: int) -> str:
@@ -149,9 +149,13 @@ def _fill(text: str, width: int) -> str:
 
 
 def _row(left: str, right: str, width: int) -> list[str]:
-    """`left` in a column of its own, or on a line of its own where it is longer."""
-    indent = " " * _COLUMN
-    text = textwrap.wrap(right, max(width - _COLUMN, 20))
-    if len(left) + 2 < _COLUMN:
-        return [f"  {left:<{_COLUMN - 2}}{text[0]}", *(indent + x for x in text[1:])]
+    """Returns `left` in a column of its own, or on a line of its own where it is
+    longer."""
+    indent = " " * _DESCRIPTION_COLUMN
+    text = textwrap.wrap(right, max(width - _DESCRIPTION_COLUMN, 20))
+    if len(left) + 2 < _DESCRIPTION_COLUMN:
+        return [
+            f"  {left:<{_DESCRIPTION_COLUMN - 2}}{text[0]}",
+            *(indent + x for x in text[1:]),
+        ]
     return [f"  {left}", *(indent + line for line in text)]

@@ -19,7 +19,7 @@ from bodyslam_jax.io.files import read_yaml
 
 
 def base_config(argv: list[str]) -> Config:
-    """The settings that `--preset` and `--settings` select.
+    """Returns the settings that `--preset` and `--settings` select.
 
     **Raises:** `InputError` if the file is not a config.yaml.
     """
@@ -34,7 +34,7 @@ def _is_paper(argv: list[str]) -> bool:
 
 
 def option(argv: list[str], flag: str) -> str | None:
-    """The value of a flag, after it or after its `=`; the last one counts."""
+    """Returns the value of a flag, after it or after its `=`; the last one counts."""
     found = None
     for arg, after in itertools.pairwise([*argv, None]):
         if arg == flag and after is not None:
@@ -45,7 +45,7 @@ def option(argv: list[str], flag: str) -> str | None:
 
 
 def read_settings(path: Path, base: Config) -> Config:
-    """`base` changed by a config.yaml.
+    """Returns `base` changed by a config.yaml.
 
     **Raises:** `InputError`, naming file and key, if it is not one.
     """
@@ -92,8 +92,8 @@ def _merged(found: Any, base: Any, where: str, stage: str = "") -> Any:
 def prepared(
     command: Callable[..., Any], argv: list[str], in_workers: bool = False
 ) -> Callable[..., Any]:
-    """The command with JAX set up before it runs, and with the default settings that
-    `--preset` and `--settings` select.
+    """Returns the command with JAX set up before it runs, and with the default settings
+    that `--preset` and `--settings` select.
 
     Args:
         in_workers: whether other processes compute, and this one on the CPU only.

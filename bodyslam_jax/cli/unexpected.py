@@ -1,4 +1,4 @@
-"""What is said of an error that nobody expected: one line, and a file with the rest."""
+"""Unexpected errors are reported in one line, with the details in a file."""
 
 import contextlib
 import platform
@@ -28,9 +28,9 @@ class Unexpected(Exception):
 
 
 def is_input(error: BaseException) -> bool:
-    """Whether an error is the input's: a file, a folder, an option.
+    """Returns True if an error is one of the input: of a file, a folder or an option.
 
-    The system's own errors are if they name a file.
+    Errors of the operating system are, if they name a file.
     """
     if isinstance(error, OSError):
         return error.filename is not None
@@ -39,7 +39,7 @@ def is_input(error: BaseException) -> bool:
 
 @contextlib.contextmanager
 def noted_in(folder: Path) -> Iterator[None]:
-    """A block whose unexpected errors leave their details in a run folder.
+    """Writes the details of unexpected errors of the block into a run folder.
 
     **Raises:** `Unexpected` in place of such an error.
     """
@@ -74,7 +74,7 @@ def write_details(error: BaseException, folder: Path | None = None) -> Path:
 
 
 def line(error: BaseException) -> str:
-    """What is said of it, in one line."""
+    """Returns the line that reports an unexpected error."""
     from bodyslam_jax.io.error_line import error_line
 
     details = error.details if isinstance(error, Unexpected) else write_details(error)

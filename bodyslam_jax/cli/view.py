@@ -50,7 +50,8 @@ def view(
 
 
 def _runs(run: Path, body_model: Path | None) -> list[dict[str, Any]]:
-    """The run, as its own page has it if there is one, and its start if it is kept."""
+    """Returns the data of the run for the page, read from its own page if it has one,
+    and those of its start if the run folder has it."""
     import bodyslam_jax as bs
     from bodyslam_jax import evaluation, view
     from bodyslam_jax.pipeline.start_of_joint import start_of_joint

@@ -1,4 +1,4 @@
-"""Feet on the ground, as pictures show them."""
+"""Contacts of feet with the ground, for pictures."""
 
 import numpy as np
 from jaxtyping import Bool
@@ -12,8 +12,8 @@ _UP = np.array([0.0, 1.0, 0.0])
 
 
 def feet_on_the_ground(result: Result) -> Bool[np.ndarray, "h t 2"]:
-    """Whether each person's left and right foot stands, in each frame: the lower foot,
-    while it is slow (`geometry.stances`)."""
+    """Returns, for each frame, whether each person's left and right foot is in contact
+    with the ground: the lower foot, while it is slow (`geometry.stances`)."""
     stands = np.zeros((*result.present.shape, 2), bool)
     for h, present in enumerate(result.present):
         for run in runs(present):

@@ -12,16 +12,16 @@ from bodyslam_jax.types import Result
 from bodyslam_jax.view.contacts import feet_on_the_ground
 from bodyslam_jax.view.style import PEOPLE, Image
 
-_MARGIN = 3.0
-"""m, of grid around everybody."""
-_MOST_LINES = 60
-_PIECES = 80
-"""Straight pieces that a line of the grid is drawn as, so that a lens may bend it."""
-_NEAR = 0.3
-"""m before the camera's plane, from where on lines are drawn."""
+_GRID_MARGIN_M = 3.0
+"""Grid beyond the outermost positions of cameras and people, m."""
+_MAX_GRID_LINES = 60
+_LINE_SEGMENTS = 80
+"""Straight segments that a line of the grid is drawn as, so that a lens may bend it."""
+_MIN_DEPTH_M = 0.3
+"""Depth from which lines are drawn, m."""
 _WHITE = (255, 255, 255)
-_FOOT = 0.14
-"""Radius of a mark, m."""
+_FOOT_MARK_RADIUS_M = 0.14
+"""Radius of a mark under a foot, m."""
 
 
 class Ground:
@@ -34,7 +34,8 @@ class Ground:
         self.stands = feet_on_the_ground(result)
 
     def draw(self, image: Image, frame: int) -> Image:
-        """The image with the grid, and with a disc under each standing foot."""
+        """Returns the image with the grid, and with a disc under each foot in
+        contact."""
         if not len(self.lines):
             return image
         drawn = image.copy()
@@ -50,7 +51,9 @@ class Ground:
         marked = drawn.copy()
         feet = self.result.joints[h, frame, np.array(FEET)[side]]
         angle = np.linspace(0, 2 * np.pi, 24)
-        circle = _FOOT * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
+        circle = _FOOT_MARK_RADIUS_M * np.stack(
+            [np.cos(angle), 0 * angle, np.sin(angle)], axis=-1
+        )
         uv, before = self._seen(feet[:, None] * [1, 0, 1] + circle, frame)
         for person, mark, shown in zip(h, uv, before, strict=True):
             if shown.all():
@@ -59,26 +62,28 @@ class Ground:
         return cv2.addWeighted(marked, 0.75, drawn, 0.25, 0)
 
     def _seen(self, p_W: Float[np.ndarray, "n m 3"], frame: int):
-        """Pixels of the picture, and which points are before the camera."""
+        """Returns pixels of the picture, and which points are in front of the
+        camera."""
         T = self.result.T_WC[frame]
         p_C = (p_W - T[:3, 3]) @ T[:3, :3]
         intrinsics = jnp.asarray(self.result.intrinsics)
         uv = np.asarray(project(intrinsics, jnp.asarray(p_C, intrinsics.dtype)))
         # Pixel centres are whole numbers, so the image's edge is at -1/2.
-        return (uv + 0.5) * self.zoom - 0.5, p_C[..., 2] > _NEAR
+        return (uv + 0.5) * self.zoom - 0.5, p_C[..., 2] > _MIN_DEPTH_M
 
 
 def _grid(result: Result) -> Float[np.ndarray, "n m 3"]:
-    """Lines at whole metres around camera and people; farther apart where many."""
+    """Returns lines at whole metres around camera and people, further apart where there
+    would be many."""
     if not result.present.any():
-        return np.zeros((0, _PIECES + 1, 3))
+        return np.zeros((0, _LINE_SEGMENTS + 1, 3))
     places = np.concatenate(
         [result.T_WC[result.located, :3, 3], result.joints[result.present][:, 0]]
     )[:, [0, 2]]
-    low, high = places.min(axis=0) - _MARGIN, places.max(axis=0) + _MARGIN
-    step = max(1.0, np.ceil((high - low).sum() / _MOST_LINES))
+    low, high = places.min(axis=0) - _GRID_MARGIN_M, places.max(axis=0) + _GRID_MARGIN_M
+    step = max(1.0, np.ceil((high - low).sum() / _MAX_GRID_LINES))
     low, high = np.floor(low / step) * step, np.ceil(high / step) * step
-    share = np.linspace(0, 1, _PIECES + 1)[:, None]
+    share = np.linspace(0, 1, _LINE_SEGMENTS + 1)[:, None]
     lines = []
     for axis in range(2):
         for place in np.arange(low[axis], high[axis] + step / 2, step):
@@ -90,5 +95,6 @@ def _grid(result: Result) -> Float[np.ndarray, "n m 3"]:
 
 
 def _sixteenths(uv: Float[np.ndarray, "n 2"]) -> np.ndarray:
-    """Of a pixel, for OpenCV; far-off points must not overflow in it."""
+    """Returns pixels in sixteenths of a pixel, as OpenCV draws them; points far outside
+    the image are clipped, as they would overflow in OpenCV."""
     return np.round(np.clip(uv, -4000, 4000) * 16).astype(np.int32)

@@ -1,4 +1,4 @@
-"""The page of a running estimate: picture, top and side view, and what is uncertain.
+"""The page of a running estimate: picture, top and side view, and uncertainties.
 
 What it shows is replaced as a whole after each frame; browsers fetch the newest. Paths
 are thinned, so that a page of an hour is as long as one of a minute.
@@ -17,25 +17,25 @@ from jaxtyping import Float, UInt8
 
 from bodyslam_jax.view.serve import PageHandler, PageServer, local_server
 
-_MOST_POINTS = 600
-"""Of a path; of a longer one every second is dropped."""
-_WIDTH = 960
-"""Widest picture, px."""
-_QUALITY = 75
+_MAX_PATH_POINTS = 600
+"""Points of a path; every second point of a longer one is dropped."""
+_MAX_WIDTH_PX = 960
+"""Width of the widest picture, px."""
+_JPEG_QUALITY = 75
 _BONES = (
     *((0, 1), (1, 4), (4, 7), (7, 10), (0, 2), (2, 5), (5, 8), (8, 11)),
     *((0, 3), (3, 6), (6, 9), (9, 12), (12, 15)),
     *((9, 13), (13, 16), (16, 18), (18, 20), (20, 22)),
     *((9, 14), (14, 17), (17, 19), (19, 21), (21, 23)),
 )
-_COLOURS = ((80, 170, 255), (255, 160, 80), (120, 220, 120), (220, 120, 220))
-"""BGR, by the number of the person."""
-_POINT = (90, 230, 120)
+_PERSON_COLORS = ((80, 170, 255), (255, 160, 80), (120, 220, 120), (220, 120, 220))
+"""Colours of people by their number, BGR."""
+_POINT_COLOR = (90, 230, 120)
 
 
 @dataclasses.dataclass
 class Path:
-    """A growing path, thinned."""
+    """A growing path that is thinned as it grows."""
 
     points: list[list[float]] = dataclasses.field(default_factory=list)
     every: int = 1
@@ -44,7 +44,7 @@ class Path:
     def add(self, point: np.ndarray) -> None:
         if self.count % self.every == 0:
             self.points.append([round(float(x), 3) for x in point])
-            if len(self.points) > _MOST_POINTS:
+            if len(self.points) > _MAX_PATH_POINTS:
                 self.points = self.points[::2]
                 self.every *= 2
         self.count += 1
@@ -81,7 +81,7 @@ class LivePage:
         """
         picture = _drawn(image, points, people)
         ok, encoded = cv2.imencode(
-            ".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+            ".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
         )
         self.paths.setdefault("camera", Path()).add(T_WC[:3, 3])
         for person, _, joints in people:
@@ -102,7 +102,7 @@ class LivePage:
         self.state = json.dumps(state).encode()
 
     def forget_paths(self) -> None:
-        """Begins all paths anew, where the world has changed by much."""
+        """Begins all paths again, where the world has changed by much."""
         self.paths.clear()
 
     def close(self) -> None:
@@ -132,16 +132,16 @@ def _drawn(
     points: Float[np.ndarray, "n 2"],
     people: Sequence[tuple[int, np.ndarray, np.ndarray]],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    zoom = min(1.0, _WIDTH / image.shape[1])
+    zoom = min(1.0, _MAX_WIDTH_PX / image.shape[1])
     picture = image.copy()
     if zoom < 1:
         size = round(image.shape[1] * zoom), round(image.shape[0] * zoom)
         picture = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     at = lambda uv: tuple(int(x) for x in np.clip(np.rint(uv * zoom), -9999, 9999))
     for uv in points:
-        cv2.circle(picture, at(uv), 1, _POINT, -1, cv2.LINE_AA)
+        cv2.circle(picture, at(uv), 1, _POINT_COLOR, -1, cv2.LINE_AA)
     for person, uv, _ in people:
-        colour = _COLOURS[person % len(_COLOURS)]
+        colour = _PERSON_COLORS[person % len(_PERSON_COLORS)]
         for a, b in _BONES:
             cv2.line(picture, at(uv[a]), at(uv[b]), colour, 3, cv2.LINE_AA)
     return picture

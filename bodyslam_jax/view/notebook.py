@@ -33,8 +33,8 @@ def notebook_scene(
     height: int = 600,
     body: BodyModel | None = None,
 ) -> NotebookScene:
-    """The page of a result for a notebook; with its images and the map's colours if the
-    folder of its run is given.
+    """Returns the page of a result for a notebook, with its images and the map's
+    colours if the folder of its run is given.
 
     Args:
         height: Of the page in the notebook, px.

@@ -68,8 +68,8 @@ def write_overlay(
 def _shown(
     size: tuple[int, int], width: int
 ) -> tuple[tuple[int, int], Float[np.ndarray, " 2"]]:
-    """The size (px, even) of images of `size` that are shown `width` wide, and their
-    pixels per pixel of the image."""
+    """Returns the size (px, even) of images of `size` that are shown `width` wide, and
+    their pixels per pixel of the image."""
     width = max(2, width // 2 * 2)
     height = max(2, round(size[1] * width / size[0] / 2) * 2)
     return (width, height), np.array([width / size[0], height / size[1]])
@@ -78,7 +78,8 @@ def _shown(
 def _images(
     first: Image | None, source: Iterator[Image], number: int, size: tuple[int, int]
 ) -> Iterator[Image]:
-    """An image for each frame, of the size of the pictures; black where missing."""
+    """Yields an image for each frame, of the size of the pictures; black where
+    missing."""
     image = first
     for _ in range(number):
         if image is None:
@@ -99,8 +100,8 @@ def pictures(
     insets: Insets,
     keypoints: Keypoints | None = None,
 ) -> Iterator[Image]:
-    """The pictures of the overlay; `images` have the size that `insets` were made for,
-    one for each frame."""
+    """Yields the pictures of the overlay; `images` have the size that `insets` were
+    made for, one for each frame."""
     coarse = coarse_body(body)
     faces = np.asarray(coarse.faces)
     num_frames = len(result.timestamps)
@@ -131,8 +132,8 @@ def pictures(
 
 
 def _above(mesh: Mesh, zoom: np.ndarray) -> tuple[float, float] | None:
-    """Where a person's name stands in the picture, px; `None` for somebody who reaches
-    behind the camera."""
+    """Returns the position of a person's name in the picture, px; `None` for a person
+    who reaches behind the camera."""
     if mesh.p_C[:, 2].min() < 0.1:
         return None
     u, v = mesh.uv[mesh.uv[:, 1].argmin()] * zoom
@@ -140,7 +141,8 @@ def _above(mesh: Mesh, zoom: np.ndarray) -> tuple[float, float] | None:
 
 
 def softened(image: Image) -> Image:
-    """With less noise and contrast: what is drawn stands out, and the video has half
-    the bytes, as OpenCV's encoder keeps all noise and has no setting for it."""
+    """Returns the image with less noise and contrast: what is drawn is clearly visible,
+    and the video has half the bytes, as OpenCV's encoder keeps all noise and has no
+    setting for it."""
     blurred = cv2.GaussianBlur(image, (0, 0), 0.9)
     return cv2.convertScaleAbs(blurred, alpha=0.88, beta=14)

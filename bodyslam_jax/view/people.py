@@ -22,22 +22,24 @@ from bodyslam_jax.types import Result
 from bodyslam_jax.view.person_style import PALE, PersonStyle, person_styles
 from bodyslam_jax.view.style import Image, polylines
 
-_CELL = 0.025
+_CELL_M = 0.025
 """Size of the cells in which vertices are merged, m."""
-_NEAR = 0.05
+_MIN_DEPTH_M = 0.05
 """Triangles nearer to the camera's plane than this are not drawn, m."""
-_STILL = 960
+_MAX_STILL_WIDTH_PX = 960
 """Greatest width of a still, px."""
-_SPECK = 12
-"""Length of a contour, px, below which it is that of a gap between triangles."""
-_LARGE = 150
-"""Height of a person, px, below which a line of 2 px would cover the arms."""
-_CHUNK = 16
+_MIN_CONTOUR_PX = 12
+"""Length of the shortest contour that is drawn, px; a shorter one is that of a gap
+between triangles."""
+_MIN_WIDE_OUTLINE_HEIGHT_PX = 150
+"""Height of the smallest person with an outline of 2 px, px: it would cover the arms of
+a smaller one."""
+_FRAMES_PER_BATCH = 16
 """Frames whose meshes are computed together."""
 
 
 def draw_frame(image: Image, result: Result, body: BodyModel, frame: int) -> Image:
-    """One frame's bodies over its image, at the image's own size.
+    """Returns an image with the bodies of its frame, at the image's own size.
 
     **Raises:** `IndexError` if the result has no such frame.
     """
@@ -51,31 +53,31 @@ def draw_frame(image: Image, result: Result, body: BodyModel, frame: int) -> Ima
 
 
 def middle_frame(result: Result) -> int:
-    """Of the frames with the most people, the one nearest to the middle."""
+    """Returns, of the frames with the most people, the one nearest to the middle."""
     number = result.present.sum(axis=0)
     frames = np.flatnonzero(number == number.max(initial=0))
     return int(frames[np.abs(frames - (len(number) - 1) / 2).argmin()])
 
 
 def still(image: Image, result: Result, body: BodyModel, frame: int) -> bytes:
-    """`draw_frame` as JPEG, at most 960 px wide."""
+    """Returns `draw_frame` as JPEG, at most 960 px wide."""
     drawn = draw_frame(image, result, body, frame)
     height, width = drawn.shape[:2]
-    if width > _STILL:
-        size = (_STILL, round(height * _STILL / width))
+    if width > _MAX_STILL_WIDTH_PX:
+        size = (_MAX_STILL_WIDTH_PX, round(height * _MAX_STILL_WIDTH_PX / width))
         drawn = cv2.resize(drawn, size, interpolation=cv2.INTER_AREA)
     return cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
 
 
 def coarse_body(body: BodyModel) -> BodyModel:
-    """The body with about a quarter of its vertices.
+    """Returns the body with about a quarter of its vertices.
 
     Vertices in one cell of a grid over the rest pose are merged into the first of
     them. As the rest is a subset, shape, skinning and joints are unchanged; keypoints
     on the skin move within their cells.
     """
     template = np.asarray(body.template)
-    cells = np.floor(template / _CELL).astype(np.int64)
+    cells = np.floor(template / _CELL_M).astype(np.int64)
     _, kept, cluster = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     # In the body's own order, as runs of vertices are skinned together.
     order = np.argsort(kept)
@@ -129,7 +131,7 @@ def _pose(
 
 
 def meshes(result: Result, body: BodyModel, frames: slice) -> Iterator[list[Mesh]]:
-    """The people present in each frame, computed for some frames at a time."""
+    """Yields the people present in each frame, computed for some frames at a time."""
     cast = lambda x: jnp.asarray(x, body.template.dtype)
     bone = np.take_along_axis(
         np.asarray(body.skin_joint),
@@ -138,9 +140,9 @@ def meshes(result: Result, body: BodyModel, frames: slice) -> Iterator[list[Mesh
     )[:, 0]
     inferred = inferred_bones(result)
     chosen = np.arange(len(result.timestamps))[frames]
-    for start in range(0, len(chosen), _CHUNK):
-        index = chosen[start : start + _CHUNK]
-        padded = np.pad(index, (0, _CHUNK - len(index)), mode="edge")
+    for start in range(0, len(chosen), _FRAMES_PER_BATCH):
+        index = chosen[start : start + _FRAMES_PER_BATCH]
+        padded = np.pad(index, (0, _FRAMES_PER_BATCH - len(index)), mode="edge")
         drawn = []
         for h in range(len(result.poses)):
             if not result.present[h, index].any():
@@ -169,7 +171,7 @@ def draw_people(
     zoom: np.ndarray,
     styles: list[PersonStyle],
 ) -> Image:
-    """Shaded bodies, those behind first, blended into the image.
+    """Returns the image with shaded bodies blended into it, the farthest first.
 
     Args:
         styles: of all people of the result.
@@ -182,7 +184,7 @@ def draw_people(
         a, b, c = (mesh.p_C[faces[:, k]] for k in range(3))
         normal = np.cross(b - a, c - a)
         faces_camera = np.sum(normal * a, 1) < 0
-        before = np.minimum(np.minimum(a[:, 2], b[:, 2]), c[:, 2]) > _NEAR
+        before = np.minimum(np.minimum(a[:, 2], b[:, 2]), c[:, 2]) > _MIN_DEPTH_M
         triangle = uv[faces]
         inside = np.all(triangle.max(1) >= -0.5, 1) & np.all(
             triangle.min(1) <= [width - 0.5, height - 0.5], 1
@@ -223,29 +225,30 @@ def draw_people(
 
 
 def _outline(image: Image, mask: UInt8[np.ndarray, "y x"], style: PersonStyle) -> None:
-    """A line around a person; in dashes around one who is not `ok`."""
+    """Draws a line around a person, dashed if the status is not `ok`."""
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for contour in contours:
-        if len(contour) < _SPECK:
+        if len(contour) < _MIN_CONTOUR_PX:
             continue
         curve = 16 * np.concatenate([contour, contour[:1]])[:, 0].astype(int)
-        width = 2 if np.ptp(contour[..., 1]) >= _LARGE else 1
+        width = 2 if np.ptp(contour[..., 1]) >= _MIN_WIDE_OUTLINE_HEIGHT_PX else 1
         polylines(image, curve, (20, 20, 20), width + 1, style.dash)
         polylines(image, curve, style.color, width, style.dash)
 
 
-_LIGHT = np.array([-0.5, -0.62, -0.6])
-"""Towards the light, from above and behind the camera, in its frame."""
+_LIGHT_DIRECTION = np.array([-0.5, -0.62, -0.6])
+"""Direction towards the light, from above and behind the camera, in its frame."""
 
 
 def _lit(
     normal: Float[np.ndarray, "f 3"], faces: Int[np.ndarray, "f 3"], num_vertices: int
 ) -> Float[np.ndarray, " f"]:
-    """Brightness of each face, smooth: of the mean normal around its corners."""
+    """Returns the brightness of each face, smooth: by the mean normal around its
+    corners."""
     around = np.zeros((num_vertices, 3))
     for axis in range(3):
         weight = np.repeat(normal[:, axis], 3)
         around[:, axis] = np.bincount(faces.ravel(), weight, num_vertices)
     smooth = around[faces].sum(1)
     smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
-    return 0.3 + 0.7 * np.clip(smooth @ _LIGHT, 0, 1)
+    return 0.3 + 0.7 * np.clip(smooth @ _LIGHT_DIRECTION, 0, 1)

@@ -11,8 +11,8 @@ from bodyslam_jax.view.style import PEOPLE, Color, Image, polylines, write_text
 
 PALE = 0.8
 """Share of white in the colour of a limb that was inferred, not measured."""
-_LINE, _SAMPLE = 17, 26
-"""px, from one line of the legend to the next, and of its samples of lines."""
+_LINE_HEIGHT_PX, _SAMPLE_LENGTH_PX = 17, 26
+"""Height of a line of the legend, and length of its sample of a line, px."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,22 +20,23 @@ class PersonStyle:
     """How one person is drawn on images."""
 
     name: str
-    """With the status, if it is not `ok`."""
+    """Name of the person, with the status if it is not `ok`."""
     words: str
     """The status in words; empty if it is `ok`."""
     color: Color
-    """BGR, of lines."""
+    """Colour of lines, BGR."""
     white: float
     """Share of white in the colour of the body."""
     opacity: float
-    """Of the body over the image: the person must show through, or a misfit would
-    not."""
+    """Opacity of the body over the image: a misfit is visible only if the person shows
+    through."""
     dash: tuple[int, int] | None
-    """px drawn and px left out of the outline and of paths; `None`: in one line."""
+    """Lengths that are drawn and left out of the outline and of paths, px; `None` for a
+    whole line."""
 
     @property
     def faint(self) -> Color:
-        """The colour on the dark insets, where no body is drawn."""
+        """Returns the colour on the dark insets, where no body is drawn."""
         share = 1.0 if self.dash is None else 0.8 if self.opacity > 0.3 else 0.55
         b, g, r = (int(share * c + (1 - share) * 60) for c in self.color)
         return b, g, r
@@ -49,7 +50,7 @@ _BY_STATUS = {
 
 
 def person_styles(result: Result) -> list[PersonStyle]:
-    """Of all people of a result, by the status that its summary reports."""
+    """Returns the style of each person of a result, by the status in its summary."""
     found = []
     for h in range(len(result.poses)):
         reported = reported_status(result.summary, h)
@@ -60,7 +61,7 @@ def person_styles(result: Result) -> list[PersonStyle]:
 
 
 class Legend:
-    """What dashes, dots and pale limbs mean, as far as a result has them."""
+    """The meaning of the dashes, dots and pale limbs that a result has."""
 
     def __init__(self, result: Result, styles: list[PersonStyle]):
         shown = [style for style, p in zip(styles, result.present) if p.any()]
@@ -76,19 +77,20 @@ class Legend:
             left = x
             if dash is not None:
                 ends: Int[np.ndarray, "2 2"] = np.array(
-                    [[x, y - 4], [x + _SAMPLE, y - 4]]
+                    [[x, y - 4], [x + _SAMPLE_LENGTH_PX, y - 4]]
                 )
                 polylines(image, 16 * ends, (0, 0, 0), 4, dash)
                 polylines(image, 16 * ends, (255, 255, 255), 2, dash)
-                left += _SAMPLE + 7
+                left += _SAMPLE_LENGTH_PX + 7
             write_text(image, text, (left, y), 0.45)
-            y -= _LINE
+            y -= _LINE_HEIGHT_PX
 
 
 def write_names(
     image: Image, names: list[tuple[str, tuple[float, float]]], size: float = 0.45
 ) -> None:
-    """Names above their places (px), moved up where they would cover one another."""
+    """Writes names above their positions (px), moved up where they would cover each
+    other."""
     high, wide = 15.0, 17.0 * size
     taken: list[tuple[float, float, float]] = []
     for text, (u, v) in sorted(names, key=lambda item: item[1]):

@@ -23,16 +23,16 @@ from bodyslam_jax.view.contacts import feet_on_the_ground
 from bodyslam_jax.view.style import PEOPLE
 from bodyslam_jax.view.video_samples import VideoSamples
 
-_MOST_POINTS = 60_000
-_MILLIMETRE = 1000.0
-_UNIT = 32767
-"""A quaternion's entries are sent as 16-bit integers, of this for 1."""
+_MAX_MAP_POINTS = 60_000
+_MILLIMETRES_PER_METRE = 1000.0
+_QUATERNION_ONE = 32767
+"""A quaternion's entries are sent as 16-bit integers; this is the integer for 1."""
 
 
 def scene_data(
     result: Result, body: BodyModel, samples: VideoSamples | None = None
 ) -> dict[str, Any]:
-    """What the page shows of one run.
+    """Returns what the page shows of one run.
 
     Args:
         samples: small images and colours of the map; without them the page shows
@@ -68,12 +68,13 @@ def _array(values: np.ndarray, dtype: Any) -> dict[str, Any]:
 
 
 def _rotations(vectors: Float[np.ndarray, "*b 3"]) -> dict[str, Any]:
-    """Unit quaternions (x y z w) of rotation vectors."""
-    return _array(np.round(so3.quaternion(vectors) * _UNIT), np.int16)
+    """Returns unit quaternions (x y z w) of rotation vectors."""
+    return _array(np.round(so3.quaternion(vectors) * _QUATERNION_ONE), np.int16)
 
 
 def _relative_sigma(result: Result) -> float | None:
-    """Relative standard deviation of all lengths; `None` where it is not known."""
+    """Returns the relative standard deviation of all lengths; `None` if it is
+    unknown."""
     sigma = (result.summary.get("scale") or {}).get("sigma")
     if sigma is None or not math.isfinite(sigma) or result.scale <= 0:
         return None
@@ -102,7 +103,7 @@ def _map(result: Result, samples: VideoSamples | None) -> dict[str, Any]:
     colors: UInt8[np.ndarray, "l 3"] = np.full(points.shape, 140, np.uint8)
     if samples is not None and len(samples.colors) == len(points):
         colors = samples.colors
-    chosen = slice(None, None, max(1, -(-len(points) // _MOST_POINTS)))
+    chosen = slice(None, None, max(1, -(-len(points) // _MAX_MAP_POINTS)))
     return {
         "points": _array(points[chosen], np.float32),
         "colors": _array(colors[chosen], np.uint8),
@@ -117,8 +118,8 @@ def _images(samples: VideoSamples | None) -> dict[str, Any]:
 
 
 def _skin(body: BodyModel) -> dict[str, Any]:
-    """Triangles and the four largest skinning weights of each vertex: of the default
-    body, the others are at most 3 %."""
+    """Returns triangles and the four largest skinning weights of each vertex: in the
+    default body, the others are at most 3 %."""
     joint, weight = np.asarray(body.skin_joint), np.asarray(body.skin_weight)
     order = np.argsort(-weight, axis=1)[:, :4]
     joint, weight = (np.take_along_axis(x, order, axis=1) for x in (joint, weight))
@@ -138,7 +139,8 @@ def _skin(body: BodyModel) -> dict[str, Any]:
 def _person(
     result: Result, body: BodyModel, h: int, inferred: Int[np.ndarray, " t"]
 ) -> dict[str, Any]:
-    """A person; the bits of `inferred` are bones that were hidden, not measured."""
+    """Returns the data of a person; bits of `inferred` are bones that were hidden, not
+    measured."""
     beta = result.betas[h]
     rest = np.asarray(rest_joints(body, jnp.asarray(beta, body.dtype)), np.float64)
     template, dirs = (
@@ -159,7 +161,7 @@ def _person(
         "color": f"#{red:02x}{green:02x}{blue:02x}",
         "present": _array(result.present[h], np.uint8),
         # Tenths of a millimetre: a body is less than 3 m from its origin.
-        "skin": _array(np.round(skin * 10 * _MILLIMETRE), np.int16),
+        "skin": _array(np.round(skin * 10 * _MILLIMETRES_PER_METRE), np.int16),
         "rest": _array(rest, np.float32),
         "pelvis": _array(rest[0] + result.trans[h], np.float32),
         "rotations": _rotations(result.poses[h].reshape(-1, 24, 3)),
@@ -173,7 +175,7 @@ def _person(
 
 
 def _footprints(result: Result, h: int, stands: np.ndarray) -> list[list[int | float]]:
-    """First frame and place (x, z, m) of each stance of a foot."""
+    """Returns the first frame and the position (x, z, m) of each stance of a foot."""
     found = []
     for foot, joint in enumerate(FEET):
         for run in runs(stands[:, foot]):

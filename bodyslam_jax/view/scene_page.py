@@ -34,7 +34,8 @@ def write_scene(
 
 
 def scene_page(runs: Sequence[dict[str, Any]]) -> str:
-    """The page of one or more runs (`scene_data`), whose first sets the timeline."""
+    """Returns the page of one or more runs (`scene_data`); the first sets the
+    timeline."""
     parts = {
         "{title}": html.escape(str(runs[0]["name"])),
         "{style}": _asset("scene.css"),
@@ -47,7 +48,7 @@ def scene_page(runs: Sequence[dict[str, Any]]) -> str:
 
 
 def read_runs(path: Path) -> list[dict[str, Any]]:
-    """The runs in a page that `write_scene` wrote.
+    """Returns the runs in a page that `write_scene` wrote.
 
     **Raises:** `InputError` if the file is no such page.
     """

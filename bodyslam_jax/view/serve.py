@@ -28,8 +28,8 @@ _TYPES = {
     ".jpg": "image/jpeg",
     ".json": "application/json",
 }
-_FILES = ("report.html", "scene.html", "overlay.webm", "overlay.mp4")
-"""What is served of a run folder."""
+_SERVED_FILES = ("report.html", "scene.html", "overlay.webm", "overlay.mp4")
+"""Files of a run folder that are served."""
 _RANGE = re.compile(r"bytes=(\d{0,15})-(\d{0,15})")
 """One range of at most 10^15 bytes; all others are ignored, as RFC 9110 allows."""
 _LOOPBACK = "127.0.0.1"
@@ -37,14 +37,14 @@ _HTTP_PORT = 80
 """Port that browsers leave out of `Host`."""
 MAX_THREADS = 32
 """Requests at a time; a browser opens six connections to a server."""
-_PATIENCE = 30.0
+_TIMEOUT_S = 30.0
 """Time for which a connection may be silent, s."""
 _CHUNK_BYTES = 1 << 18
-_SAFE = "'self' 'unsafe-inline' data: blob:"
+_CONTENT_SOURCES = "'self' 'unsafe-inline' data: blob:"
 _HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": (
-        f"default-src {_SAFE}; object-src 'none'; base-uri 'none'; "
+        f"default-src {_CONTENT_SOURCES}; object-src 'none'; base-uri 'none'; "
         "form-action 'none'; frame-ancestors 'self'"
     ),
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -77,12 +77,12 @@ class PageServer(ThreadingHTTPServer):
             self.free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Browsers end connections when they like; that is worth no traceback."""
+        """Prints no traceback: browsers end connections when they like."""
         log.debug("%s", client_address, exc_info=True)
 
 
 def page_server(page: str, folder: Path, port: int = 0) -> PageServer:
-    """A server of `page` at `/`, and of the pictures in the run folder beside it.
+    """Returns a server of `page` at `/`, and of the pictures in the run folder.
 
     It listens to this machine only. Port 0 is a free one; `address_of` has it.
 
@@ -92,7 +92,7 @@ def page_server(page: str, folder: Path, port: int = 0) -> PageServer:
 
 
 def local_server(handler: Any, port: int) -> PageServer:
-    """A server of what `handler` answers, on this machine only.
+    """Returns a server, on this machine only, of what `handler` answers.
 
     **Raises:** as `page_server`.
     """
@@ -105,7 +105,7 @@ def local_server(handler: Any, port: int) -> PageServer:
 
 
 def address_of(server: ThreadingHTTPServer) -> str:
-    """Of the page, as a browser takes it."""
+    """Returns the address of the page, as a browser takes it."""
     return f"http://{_LOOPBACK}:{server.server_address[1]}/"
 
 
@@ -113,7 +113,7 @@ class PageHandler(BaseHTTPRequestHandler):
     """Answers requests for this address by its own names, and no others."""
 
     protocol_version = "HTTP/1.1"
-    timeout = _PATIENCE
+    timeout = _TIMEOUT_S
 
     def do_GET(self) -> None:
         if "Content-Length" in self.headers or "Transfer-Encoding" in self.headers:
@@ -127,17 +127,18 @@ class PageHandler(BaseHTTPRequestHandler):
         self.do_GET()
 
     def answer(self, name: str) -> None:
-        """Sends what has this name, or that there is no such thing."""
+        """Sends what has this name, or that it does not exist."""
         self.send_error(HTTPStatus.NOT_FOUND)
 
     def send_bytes(self, content: bytes, suffix: str) -> None:
-        """Sends a part of, or all of, what is in memory."""
+        """Sends content that is in memory, all of it or the requested part."""
         copy = lambda start, end: self.wfile.write(content[start:end])
         self._send(len(content), suffix, copy)
 
     def _is_addressed(self) -> bool:
-        """Whether the request is for this server under its own names: one that another
-        name leads here, as by DNS rebinding, is a foreign page's."""
+        """Returns True if the request is for this server under its own names. A request
+        under another name that leads here, as by DNS rebinding, is one of a foreign
+        page."""
         address: Any = self.server.server_address
         port = address[1]
         known = {f"{name}:{port}" for name in (_LOOPBACK, "localhost")}
@@ -147,7 +148,8 @@ class PageHandler(BaseHTTPRequestHandler):
         return len(hosts) == 1 and hosts[0].strip().lower() in known
 
     def _send(self, size: int, suffix: str, copy: Any) -> None:
-        """All of it or, as browsers ask where they seek in a video, a part."""
+        """Sends the whole content or, as browsers ask where they seek in a video, a
+        part."""
         start, end, status = 0, size, HTTPStatus.OK
         found = _RANGE.fullmatch(self.headers.get("Range", "").strip())
         if found and found.group() != "bytes=-":
@@ -179,11 +181,11 @@ class PageHandler(BaseHTTPRequestHandler):
         super().end_headers()
 
     def version_string(self) -> str:
-        """The server's name, without versions of its parts."""
+        """Returns the server's name, without versions of its parts."""
         return "bodyslam"
 
     def log_message(self, format: str, *args: object) -> None:
-        """Requests are not worth a line."""
+        """Logs nothing of single requests."""
 
 
 class _Handler(PageHandler):
@@ -218,10 +220,10 @@ class _Handler(PageHandler):
 
 @contextlib.contextmanager
 def _opened(folder: Path, name: str) -> Iterator[BinaryIO | None]:
-    """A picture of the run; `None` if there is none, or a link leads out of the folder
-    to it."""
+    """Returns an open picture of the run; `None` if it does not exist, or a link leads
+    to it out of the folder."""
     file = None
-    if name in _FILES:
+    if name in _SERVED_FILES:
         with contextlib.suppress(OSError, RuntimeError):  # none, or links in a circle
             path = (folder / name).resolve(strict=True)
             if path.is_relative_to(folder.resolve()):

@@ -9,8 +9,9 @@ from bodyslam_jax.types import Result
 from bodyslam_jax.view.person_style import person_styles
 from bodyslam_jax.view.style import CAMERA, Image, blend_inset, polylines
 
-_WIDEST = 8.0
-"""m; where everybody's way is longer, the inset moves along with them."""
+_MAX_SPAN_M = 8.0
+"""Width of the inset in the world, m; where the paths are longer, it moves along with
+people."""
 _LIMBS = (
     (15, 12, 9, 6, 3, 0),
     (0, 1, 4, 7, 10),
@@ -20,10 +21,11 @@ _LIMBS = (
 
 
 class SideView:
-    """Seen across the direction in which everybody's way is longest."""
+    """The scene from the side, across the horizontal direction in which paths are
+    longest."""
 
     def __init__(self, result: Result, width: int):
-        """`width` of the inset, px."""
+        """The inset is `width` wide, px."""
         self.result, self.width = result, width
         self.styles = person_styles(result)
         places = [result.T_WC[result.located, :3, 3]]
@@ -41,8 +43,8 @@ class SideView:
         way = every @ self.along
         self.centre = (way.min() + way.max()) / 2
         extent = max(1.15 * (way.max() - way.min()), 3.0)
-        self.moves = extent > _WIDEST
-        self.zoom = width / min(extent, _WIDEST)
+        self.moves = extent > _MAX_SPAN_M
+        self.zoom = width / min(extent, _MAX_SPAN_M)
         self.low = min(0.0, float(every[:, 1].min()))
         middle, radius = head_ball(joints)
         top = np.append(every[:, 1], middle[:, 1] + radius).max()

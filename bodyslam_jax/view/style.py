@@ -8,7 +8,7 @@ from bodyslam_jax.geometry.runs import runs
 
 Image = UInt8[np.ndarray, "y x 3"]
 Color = tuple[int, int, int]
-"""BGR"""
+"""Blue, green, red; 0 to 255."""
 CAMERA: Color = (214, 111, 31)
 PEOPLE: tuple[Color, ...] = (
     (36, 110, 232),
@@ -26,7 +26,7 @@ PEOPLE: tuple[Color, ...] = (
 def write_text(
     image: Image, text: str, place: tuple[int, int], size: float = 0.5
 ) -> None:
-    """White on a dark rim: readable on any frame."""
+    """Writes white text on a dark rim, which is readable on any frame."""
     for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
         cv2.putText(
             image,
@@ -58,7 +58,7 @@ def polylines(
     width: int,
     dash: tuple[int, int] | None = None,
 ) -> None:
-    """A curve through points in sixteenths of a pixel, in one line or in dashes.
+    """Draws a curve through points in sixteenths of a pixel, whole or in dashes.
 
     Args:
         dash: px that are drawn, and px left out.
@@ -71,7 +71,7 @@ def polylines(
 def _dashes(
     curve: Int[np.ndarray, "n 2"], dash: tuple[int, int]
 ) -> list[Int[np.ndarray, "_ 2"]]:
-    """The parts of a curve that are drawn, with a point each pixel."""
+    """Returns the parts of a curve that are drawn, with a point each pixel."""
     if len(curve) < 2:
         return []
     step = np.linalg.norm(np.diff(curve, axis=0), axis=1) / 16

@@ -8,14 +8,14 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 from bodyslam_jax.io.video import open_video
 
-_WIDTH, _QUALITY = 240, 70
+_WIDTH_PX, _JPEG_QUALITY = 240, 70
 """px; of JPEG, 0 to 100"""
 
 
 def write_thumbnail(video: Path, path: Path) -> bool:
-    """Writes the middle frame as JPEG; returns whether the video has one.
+    """Writes the middle frame as JPEG; returns False if the video has none.
 
-    One that is newer than the video is kept.
+    A file that is newer than the video is kept.
     """
     if path.exists() and path.stat().st_mtime >= video.stat().st_mtime:
         return True
@@ -31,9 +31,11 @@ def write_thumbnail(video: Path, path: Path) -> bool:
         capture.release()
     if not found:
         return False
-    height = max(1, round(image.shape[0] * _WIDTH / image.shape[1]))
-    small = cv2.resize(image, (_WIDTH, height), interpolation=cv2.INTER_AREA)
-    encoded, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    height = max(1, round(image.shape[0] * _WIDTH_PX / image.shape[1]))
+    small = cv2.resize(image, (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    encoded, data = cv2.imencode(
+        ".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    )
     if encoded:
         atomic.write_bytes(path, data.tobytes())
     return encoded

@@ -15,11 +15,12 @@ from bodyslam_jax.view.style import (
     write_text,
 )
 
-_POINT = (90, 230, 120)
+_POINT_COLOR = (90, 230, 120)
 
 
 def trails(tracks: Tracks | None, num_frames: int, zoom: np.ndarray) -> list[list]:
-    """For each frame, its points and their positions in the preceding frames."""
+    """Returns, for each frame, its points and their positions in the preceding
+    frames."""
     found: list[list] = [[] for _ in range(num_frames)]
     if tracks is None:
         return found
@@ -37,9 +38,9 @@ def trails(tracks: Tracks | None, num_frames: int, zoom: np.ndarray) -> list[lis
 
 def draw_trails(image: Image, lines: list[np.ndarray]) -> None:
     curves = [np.round(trail * 16).astype(np.int32) for trail in lines]
-    cv2.polylines(image, curves, False, _POINT, 1, cv2.LINE_AA, 4)
+    cv2.polylines(image, curves, False, _POINT_COLOR, 1, cv2.LINE_AA, 4)
     for line in curves:
-        cv2.circle(image, line[-1].tolist(), 2 * 16, _POINT, -1, cv2.LINE_AA, 4)
+        cv2.circle(image, line[-1].tolist(), 2 * 16, _POINT_COLOR, -1, cv2.LINE_AA, 4)
 
 
 class Plan:
@@ -63,7 +64,8 @@ class Plan:
         self.background = self._grid(extent)
 
     def _to_inset(self, points: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:
-        """Seen from above with z up the picture, x runs to the left; in sixteenths."""
+        """Returns positions in the inset, in sixteenths of a pixel: seen from above
+        with z up the picture, x runs to the left."""
         uv = self.side / 2 - self.zoom * (points - self.centre)
         return np.round(uv * 16).astype(np.int32)
 
@@ -87,7 +89,7 @@ class Plan:
     def _paths(
         self, end: int
     ) -> list[tuple[np.ndarray, Color, tuple[int, int] | None]]:
-        """Paths up to a frame, their colours and dashes."""
+        """Returns the paths up to a frame, with their colours and dashes."""
         paths: list[tuple[np.ndarray, Color, tuple[int, int] | None]]
         paths = [(self.result.T_WC[:end, [0, 2], 3], CAMERA, None)]
         for h, present in enumerate(self.result.present):

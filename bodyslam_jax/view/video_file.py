@@ -17,12 +17,15 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.view.style import Image
 
 Codec = Literal["VP8", "VP9", "H264"]
-_QUALITY = "24"
-"""H.264's constant rate factor: smaller is better and larger; 18 to 28 is usual."""
+_H264_RATE_FACTOR = "24"
+"""Constant rate factor of H.264: smaller is better and larger; 18 to 28 is usual."""
 
 
 def check_codec(codec: Codec) -> None:
-    """**Raises:** `InputError`, which says how to get it, if H.264 is not installed."""
+    """Checks that the encoder is installed.
+
+    **Raises:** `InputError`, which says how to install it, if H.264 is not.
+    """
     if codec == "H264" and importlib.util.find_spec("av") is None:
         raise InputError(
             "overlay_video mp4: PyAV is not installed, expected the extra `video`; "
@@ -84,7 +87,7 @@ def _h264(path: Path, size: tuple[int, int], fps: float, _: Codec) -> Iterator:
         stream = container.add_stream("libx264", rate=rate)
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": _QUALITY, "preset": "veryfast"}
+        stream.options = {"crf": _H264_RATE_FACTOR, "preset": "veryfast"}
 
         def write(picture: Image) -> None:
             frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
@@ -95,7 +98,8 @@ def _h264(path: Path, size: tuple[int, int], fps: float, _: Codec) -> Iterator:
 
 
 def can_write(path: Path, codec: str) -> bool:
-    """Whether this OpenCV has the encoder of a four-letter code for such a file."""
+    """Returns True if this OpenCV has the encoder of a four-letter code for such a
+    file."""
     with _quiet():
         fourcc = cv2.VideoWriter.fourcc(*codec)
         writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, fourcc, 30.0, (64, 64))

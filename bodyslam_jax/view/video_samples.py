@@ -1,4 +1,4 @@
-"""What the 3D view takes from the video: small images, and colours of the map."""
+"""Small images and colours of the map, which the 3D view takes from the video."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator
@@ -10,26 +10,27 @@ from jaxtyping import Int, UInt8
 from bodyslam_jax.types import Tracks
 from bodyslam_jax.view.style import Image
 
-_MOST_IMAGES = 400
-_MOST_BYTES = 3_600_000
-"""Of all small images, so that the page of 1,000 frames has less than 8 MB."""
-_WIDTH = 320
-"""px"""
-_QUALITY = 55
-"""Of JPEG, 0 to 100."""
+_MAX_IMAGES = 400
+_MAX_IMAGE_BYTES = 3_600_000
+"""Size of all small images, bytes, so that the page of 1,000 frames has less than 8
+MB."""
+_IMAGE_WIDTH_PX = 320
+"""Width of a small image, px."""
+_JPEG_QUALITY = 55
+"""Quality of JPEG, 0 to 100."""
 
 
 @dataclasses.dataclass(frozen=True)
 class VideoSamples:
-    """Of a video whose map has `l` landmarks."""
+    """Samples of a video whose map has `l` landmarks."""
 
     frame: Int[np.ndarray, " k"]
     """Frames with a small image, increasing."""
     images: tuple[bytes, ...]
     """JPEG, one for each of `frame`."""
     colors: UInt8[np.ndarray, "l 3"]
-    """Of the landmarks, RGB: the mean over the pixels that show them; grey where none
-    does."""
+    """Colours of the landmarks, RGB: the mean over the pixels that show them; grey
+    where none does."""
 
 
 class VideoSampler:
@@ -47,7 +48,7 @@ class VideoSampler:
         self.whole: Image | None = None
         """The image of `whole_frame`, once it has passed."""
         self._whole_frame = whole_frame
-        self._step = max(1, -(-num_frames // _MOST_IMAGES))
+        self._step = max(1, -(-num_frames // _MAX_IMAGES))
         self._images: dict[int, bytes] = {}
         self._tracks = tracks
         if tracks is not None:
@@ -58,7 +59,8 @@ class VideoSampler:
         self._count = np.zeros(num_landmarks)
 
     def watch(self, images: Iterable[Image]) -> Iterator[Image]:
-        """The images (BGR, one per frame), unchanged; each is sampled as it passes."""
+        """Yields the images (BGR, one per frame) unchanged; each is sampled as it
+        passes."""
         for frame, image in enumerate(images):
             if frame == self._whole_frame:
                 self.whole = image.copy()
@@ -69,11 +71,11 @@ class VideoSampler:
             yield image
 
     def samples(self) -> VideoSamples:
-        """Of the images that passed so far."""
+        """Returns the samples of the images that passed so far."""
         kept = list(self._images)
         total = sum(map(len, self._images.values()))
-        if total > _MOST_BYTES:
-            number = int(len(kept) * _MOST_BYTES / total)
+        if total > _MAX_IMAGE_BYTES:
+            number = int(len(kept) * _MAX_IMAGE_BYTES / total)
             chosen = np.linspace(0, len(kept) - 1, number).round().astype(int)
             kept = [kept[k] for k in chosen]
         mean = self._sum / np.maximum(self._count, 1)[:, None]
@@ -94,8 +96,8 @@ class VideoSampler:
 
 def _small(image: Image) -> bytes:
     height, width = image.shape[:2]
-    scale = min(1.0, _WIDTH / max(width, height))
+    scale = min(1.0, _IMAGE_WIDTH_PX / max(width, height))
     size = (max(1, round(scale * width)), max(1, round(scale * height)))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
     return cv2.imencode(".jpg", small, options)[1].tobytes()
