@@ -563,7 +563,7 @@ def test_a_late_window_takes_all_in_and_compiles_nothing(long_walk):
 @pytest.mark.slow
 def test_a_window_that_is_too_late_goes_on_at_the_newest_frames(walk, monkeypatch):
     sequence, truth = walk
-    monkeypatch.setattr(live, "_PENDING", 2 * CHUNK)
+    monkeypatch.setattr(live, "_MAX_WAITING_FRAMES", 2 * CHUNK)
     online, pool = late(sequence, 3.0)
     play_late(online, pool, sequence)
     assert max(pool.taken) <= 2 * CHUNK

@@ -1,6 +1,7 @@
-"""People of a running video: who is there, what the map leaves out, and their bodies.
+"""People of a running video: their keypoints, the mask of the map, and their bodies.
 
-A body is filtered from frame to frame, and begins anew where a window has solved it.
+A body is filtered from frame to frame; the filter begins again at the solution of a
+window.
 """
 
 import numpy as np
@@ -14,16 +15,16 @@ from bodyslam_jax.people.live import LivePeople
 from bodyslam_jax.sfm.person_mask import draw_person
 from bodyslam_jax.types import Intrinsics
 
-_MARGIN = 0.06
-"""Width that is masked around people, of their height, as offline."""
-_GONE = 0.5
-"""s without keypoints after which a person is not in the estimate."""
-_MEAN = np.zeros(10)
-"""β of somebody of whom no window knows."""
+_MASK_MARGIN = 0.06
+"""Width of the mask around a person relative to the person's height, as offline."""
+_MAX_UNSEEN_S = 0.5
+"""Time without keypoints after which a person is not in the estimate, s."""
+_MEAN_BETAS = np.zeros(10)
+"""β of a person whom no window has solved."""
 
 
 class LiveBodies:
-    """People by their numbers, their filters, and which feet stand."""
+    """People by their numbers, with their filters and the contacts of their feet."""
 
     def __init__(self, config: Config, body: BodyModel, fps: float) -> None:
         self.config, self.body, self.fps = config, body, fps
@@ -31,15 +32,15 @@ class LiveBodies:
         self.filters: dict[int, PersonFilter] = {}
         self.last_seen: dict[int, float] = {}
         self.contacts: dict[int, Float[np.ndarray, " 4"]] = {}
-        """As the last window has them, in the person's last frame there."""
+        """Contacts in the person's last frame of the last window."""
 
     def find(
         self,
         image: UInt8[np.ndarray, "y x 3"] | None,
         keypoints: Float[np.ndarray, "p 25 3"] | None,
     ) -> dict[int, Float[np.ndarray, "25 3"]]:
-        """Keypoints (u px, v px, confidence) in the next frame, by person: those given,
-        or else as the networks find them."""
+        """Returns keypoints (u px, v px, confidence) in the next frame, by person:
+        those given, or else those that the networks find."""
         if not self.config.people:
             return {}
         if keypoints is not None:
@@ -51,12 +52,12 @@ class LiveBodies:
     def mask(
         self, people: dict[int, np.ndarray], intrinsics: Intrinsics
     ) -> UInt8[np.ndarray, "y x"] | None:
-        """Not 0 where people are; `None` without anybody."""
+        """Returns a mask that is not 0 where people are; `None` without people."""
         if not people:
             return None
         mask = np.zeros((intrinsics.height, intrinsics.width), np.uint8)
         for points in people.values():
-            draw_person(mask, points, _MARGIN)
+            draw_person(mask, points, _MASK_MARGIN)
         return mask
 
     def follow(
@@ -66,8 +67,8 @@ class LiveBodies:
         intrinsics: Intrinsics,
         shapes: dict[int, np.ndarray],
     ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-        """T_CH and θ of everybody who is here or was half a second ago; `shapes` are
-        those that windows know."""
+        """Returns T_CH and θ of the people who were visible within the last half
+        second; `shapes` are those that windows have solved."""
         found = {}
         for person in people:
             if person not in self.filters:
@@ -76,18 +77,18 @@ class LiveBodies:
                 )
             self.last_seen[person] = timestamp
         for person, one in list(self.filters.items()):
-            if timestamp - self.last_seen[person] > _GONE:
+            if timestamp - self.last_seen[person] > _MAX_UNSEEN_S:
                 del self.filters[person]
                 self.contacts.pop(person, None)
                 continue
             points = people.get(person, np.zeros((25, 3)))
-            body = one.update(timestamp, points, shapes.get(person, _MEAN))
+            body = one.update(timestamp, points, shapes.get(person, _MEAN_BETAS))
             if body is not None:
                 found[person] = body.T_CH, body.body_pose
         return found
 
     def learn(self, solved: Solved, shapes: dict[int, np.ndarray]) -> None:
-        """Takes contacts and newest bodies from a window."""
+        """Updates contacts and newest bodies from a window."""
         for h, person in enumerate(solved.people):
             if person is None or not solved.present[h].any():
                 continue
@@ -96,4 +97,4 @@ class LiveBodies:
             if person in self.filters:
                 body = Body(solved.roots[h, last], solved.poses[h, last])
                 at = float(solved.times[last])
-                self.filters[person].anchor(at, body, shapes.get(person, _MEAN))
+                self.filters[person].anchor(at, body, shapes.get(person, _MEAN_BETAS))

@@ -1,4 +1,4 @@
-"""What is known after a frame, in the metric world, and the world itself."""
+"""The estimate after a frame in the metric world, and the transform to that world."""
 
 import dataclasses
 
@@ -15,10 +15,10 @@ from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.online.window import Solved
 from bodyslam_jax.pipeline.to_metric import sole_height
 
-_FOLLOWS = 0.3
-"""Share by which the floor follows a window's."""
-_STANDS = 0.5
-"""Probability of contact from which a foot tells the floor."""
+_FLOOR_GAIN = 0.3
+"""Weight of a window's floor in the running estimate of the floor."""
+_MIN_CONTACT_PROBABILITY = 0.5
+"""Least probability of contact of a foot that determines the floor."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,24 +26,25 @@ class PersonEstimate:
     """One person in one frame, in the metric world."""
 
     person: int
-    """The same number as long as the person is recognised, and in the result's order
-    of numbers."""
+    """Number of the person: the same as long as the person is recognised, and in the
+    order of the result."""
     T_WH: Float[np.ndarray, "4 4"]
-    """Root; the translation is the pelvis joint, m."""
+    """Pose of the root; the translation is the pelvis joint, m."""
     poses: Float[np.ndarray, " 72"]
     """SMPL's joint rotations, axis-angle, rad; the first is the root's in W."""
     betas: Float[np.ndarray, " 10"]
     joints: Float[np.ndarray, "24 3"]
     """m"""
     contacts: Float[np.ndarray, " 4"] | None
-    """Probability that left toe, left heel, right toe, right heel stand, in the last
-    frame that the window has solved; `None` if none has the person."""
+    """Probability that left toe, left heel, right toe, right heel are in contact with
+    the ground, in the last frame that the window has solved; `None` if none has the
+    person."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """What is known as soon as a frame is there. W has y up, z ahead of the first
-    camera, and the floor at 0 once feet have stood on it."""
+    """The estimate that is available right after a frame. W has y up, z forward from
+    the first camera, and the floor at 0 once feet have been in contact with it."""
 
     frame: int
     """Number of frames before this one that were used."""
@@ -51,54 +52,57 @@ class Estimate:
     """s"""
     T_WC: Float[np.ndarray, "4 4"]
     """Camera to world; in metres once the scale is known, before in units of the map.
-    The last known one where the camera is lost."""
+    Where the camera is lost, the last known one."""
     located: bool
     people: tuple[PersonEstimate, ...]
     scale: float
-    """m per map unit; NaN as long as nobody told it."""
+    """m per map unit; NaN as long as it is unknown."""
     scale_sigma: float
-    """Standard deviation of `scale`; NaN with it."""
+    """Standard deviation of `scale`, m per map unit; NaN as long as it is unknown."""
     status: str
-    """`starting`: no map yet; `tracking`; `lost`: the camera fits the map nowhere;
-    `late`: the frame was not used, as its time is not after that of the last one."""
+    """`starting`: no map yet; `tracking`; `lost`: the camera cannot be located in
+    the map; `late`: the frame was not used, as its time is not after that of the
+    last one."""
     notes: tuple[str, ...]
-    """What to know about it, a line each."""
+    """Warnings about the estimate, one line each."""
     latency: float
-    """From the call to its end, s."""
+    """Time from the call of `update` to its end, s."""
 
 
 @dataclasses.dataclass
 class World:
-    """From a map's world to the metric one. It changes when a window has been solved,
-    so that estimates jump by what was learnt."""
+    """The similarity transform from a map's world to the metric one. It changes with
+    each solved window, so that estimates may jump."""
 
     turn: Float[np.ndarray, "3 3"] = dataclasses.field(
         default_factory=lambda: np.diag([-1.0, -1.0, 1.0])
     )
-    """Map to world."""
+    """Rotation from the map to the world."""
     scale: float = 1.0
     origin: Float[np.ndarray, " 3"] = dataclasses.field(
         default_factory=lambda: np.zeros(3)
     )
-    """The world's place of the map's origin, m."""
+    """Position of the map's origin in the world, m."""
     trunks: Float[np.ndarray, " 3"] = dataclasses.field(
         default_factory=lambda: np.zeros(3)
     )
-    """Sum of the trunks of frames that have left the window, in the map."""
+    """Sum of the directions of trunks in frames that have left the window, in the
+    map."""
     inside: dict[int, Float[np.ndarray, " 3"]] = dataclasses.field(default_factory=dict)
-    """The trunks of each frame of the last window, by its number."""
+    """Sum of the directions of trunks in each frame of the last window, by its
+    number."""
     height: float | None = None
-    """Of the first camera over the floor, m."""
+    """Height of the first camera over the floor, m."""
 
     def camera(self, T_WC: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """A camera of the map in the metric world."""
+        """Returns the pose of a camera of the map in the metric world."""
         found = np.eye(4)
         found[:3, :3] = self.turn @ T_WC[:3, :3]
         found[:3, 3] = self.scale * self.turn @ T_WC[:3, 3] + self.origin
         return found
 
     def learn(self, solved: Solved, body: BodyModel) -> None:
-        """Takes scale, up and floor from a window."""
+        """Updates scale, gravity and floor from a window."""
         known = np.isfinite(solved.scale_sigma)
         self.scale = solved.scale if known else 1.0
         ups = solved.roots[..., :3, 1]
@@ -117,7 +121,7 @@ class World:
 
     def _find_floor(self, solved: Solved, body: BodyModel, there: np.ndarray) -> None:
         stands = solved.contacts.reshape(*there.shape, 2, 2).max(axis=-1)
-        stands = (stands > _STANDS) & there[..., None]
+        stands = (stands > _MIN_CONTACT_PROBABILITY) & there[..., None]
         if not stands.any():
             return
         T_WC = np.stack([self.camera(T) for T in solved.T_WC])
@@ -135,7 +139,7 @@ class World:
             sole = sole_height(body, solved.shapes[h])
             heights.append((up - sole)[stands[h, rows]])
         floor = -float(np.median(np.concatenate(heights)))
-        share = _FOLLOWS if self.height is not None else 1.0
+        share = _FLOOR_GAIN if self.height is not None else 1.0
         before = self.height if self.height is not None else floor
         self.height = before + share * (floor - before)
         self.origin = np.array([0.0, self.height, 0.0])
@@ -149,9 +153,10 @@ def _joints(body: BodyModel, poses: object, shapes: object) -> object:
 def joints_of(
     body: BodyModel, poses: Float[np.ndarray, "t 23 3"], shape: Float[np.ndarray, " 10"]
 ) -> Float[np.ndarray, "t 24 3"]:
-    """Joints about the pelvis in the root frame, m; compiled for two lengths."""
+    """Returns joints relative to the pelvis in the root frame, m; compiled for two
+    lengths."""
     frames = len(poses)
-    size = 1 if frames == 1 else _LENGTH
+    size = 1 if frames == 1 else _COMPILED_FRAMES
     longer = np.zeros((size, 23, 3))
     longer[:frames] = poses
     shapes = np.broadcast_to(shape, (size, 10))
@@ -160,7 +165,7 @@ def joints_of(
     return np.asarray(_joints(body, *given), float)[:frames]
 
 
-_LENGTH = 60
+_COMPILED_FRAMES = 60
 
 
 def placed(
@@ -172,7 +177,7 @@ def placed(
     body: BodyModel,
     contacts: Float[np.ndarray, " 4"] | None,
 ) -> PersonEstimate:
-    """A person of the camera frame in the world of that camera."""
+    """Returns the estimate of a person, given in the camera frame, in the world."""
     T_WH = T_WC @ T_CH
     local = joints_of(body, body_pose[None], shape)[0]
     poses = np.concatenate([so3.log(T_WH[:3, :3]), body_pose.reshape(69)])

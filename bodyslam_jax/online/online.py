@@ -1,9 +1,9 @@
 """`Online`: an estimate after every frame, and the usual result at the end.
 
 The thread that calls `update` follows points, locates the camera and filters people; a
-second one solves windows. The first never waits for the second: it hands over frames of
-the window ten at a time, and takes in what the last window has found as soon as it is
-there (`docs/live.md`).
+second one solves windows. The first never waits for the second: it passes on frames of
+the window ten at a time, and takes over the solution of the last window once it is
+ready (`docs/live.md`).
 """
 
 import dataclasses
@@ -42,31 +42,32 @@ from bodyslam_jax.types import Intrinsics, Result, Sequence, SfmResult
 
 log = logging.getLogger(__name__)
 
-_RATE = 10.0
-"""Frames of the window in a second, at most: what two cores solve while the video runs
+_MAX_WINDOW_RATE = 10.0
+"""Largest rate of the window's frames, 1/s: what two cores solve while the video runs
 (`benchmarks/online.md`)."""
-_PLACE_EVERY = 2.0
-"""s between two places that are remembered."""
-_RELOCATE_EVERY = 3
-"""Frames between two attempts to locate a lost camera."""
-_LOST = 2.0
-"""s after which a lost camera that sees points begins a new map."""
-_PENDING = 10 * CHUNK
-"""Most frames that wait for the window when it begins with them; if there are more, it
-goes on at the newest ones, and the others keep the cameras that the map located."""
-_NEWEST = 2 * CHUNK
-"""Frames that are left then."""
+_KEYFRAME_INTERVAL_S = 2.0
+"""Time between two keyframes that are kept for relocalisation, s."""
+_RELOCALISATION_INTERVAL = 3
+"""Frames between two attempts to relocalise a lost camera."""
+_MAX_LOST_S = 2.0
+"""Time after which a lost camera that sees points begins a new map, s."""
+_MAX_WAITING_FRAMES = 10 * CHUNK
+"""Largest number of frames that wait for the window when it begins with them. Of more
+frames it takes the newest, and the others keep the cameras that the map located."""
+_NUM_NEWEST_FRAMES = 2 * CHUNK
+"""Number of frames that the window takes then."""
 _TWO_MAPS = (
     "the camera was lost and a new map began: the way between the two maps is not known"
 )
-_POINTS_AGAIN = 100
-"""Points that a camera begins with where it was lost."""
+_NUM_RELOCALISATION_POINTS = 100
+"""Number of points with which a camera resumes tracking after it was lost."""
 
 
 class Online:
-    """The estimate while a video runs; memory for a window, and a record of poses.
+    """The estimate while a video runs; its memory is that of a window and of a record
+    of poses.
 
-    One object is of one video. `update` and `finish` are called by one thread.
+    One object is for one video. `update` and `finish` are called by one thread.
     """
 
     def __init__(
@@ -99,7 +100,7 @@ class Online:
         self.config, self.fps, self.places, self.name = config, fps, places, name
         self.body = load_body_model(config.body_model)
         self.intrinsics = intrinsics
-        self.stride = max(1, round(fps / _RATE))
+        self.stride = max(1, round(fps / _MAX_WINDOW_RATE))
         self.step = self.stride / fps
         self.pool = ThreadPoolExecutor(1) if threads else None
         self.job: Future[list[Solved]] | None = None
@@ -111,17 +112,18 @@ class Online:
         self.warnings: dict[str, None] = {}
         self.seconds: dict[str, float] = {}
         self.number = -1
-        """Of the map."""
+        """Number of the current map."""
         self.video: Path | None = None
         """The file that the frames are of, for the result's pictures."""
         self.picks: list[int] = []
-        """Which of its frames they are."""
+        """Indices of the frames in that file."""
         self.inputs: tuple[Sequence, SfmResult]
         """What the result was made of, after `finish`."""
 
     def prepare(self, size: tuple[int, int] | None = None) -> None:
-        """Compiles all programs, or takes them from JAX's cache, on an invented scene:
-        no frame waits for it then. The first `update` does it if nobody has.
+        """Compiles all programs, or loads them from JAX's cache, on a synthetic scene,
+        so that no frame has to wait for it. The first `update` does it if it has not
+        been done.
 
         **Arguments:** `size`: width and height of the images (px), from which the
         intrinsics are guessed if none were given.
@@ -151,7 +153,7 @@ class Online:
         *,
         points: tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]] | None = None,
     ) -> Estimate:
-        """Takes the next frame in.
+        """Processes the next frame and returns the estimate after it.
 
         **Arguments:**
 
@@ -196,8 +198,8 @@ class Online:
         return self.latest
 
     def finish(self) -> Result:
-        """Solves what is left in the window and returns the result of all frames, as
-        an offline run has it: metric, y up, with its summary.
+        """Solves the remaining frames of the window and returns the result of all
+        frames, as an offline run has it: metric, y up, with its summary.
 
         **Raises:** `InputError` if fewer than three frames were used.
         """
@@ -233,14 +235,14 @@ class Online:
 
     @property
     def points(self) -> Float[np.ndarray, "n 2"]:
-        """Points that are followed in the last image, px."""
+        """Returns the points that are tracked in the last image, px."""
         return self.follower.uv if self.started else np.zeros((0, 2))
 
     def drawn(
         self, estimate: Estimate
     ) -> list[tuple[int, Float[np.ndarray, "24 2"], Float[np.ndarray, "24 3"]]]:
-        """Number, joints in the image (px) and joints in the world (m) of the people
-        of an estimate."""
+        """Returns number, joints in the image (px) and joints in the world (m) of the
+        people of an estimate."""
         assert self.intrinsics is not None
         found = []
         for one in estimate.people:
@@ -296,7 +298,7 @@ class Online:
         uv: np.ndarray,
         people: dict[int, np.ndarray],
     ) -> str:
-        """Locates the camera and hands frames to the window; the status."""
+        """Locates the camera and passes frames to the window; returns the status."""
         if not self.map.begun:
             self.waiting.append((timestamp, people, ids, uv))
             poses = self.map.begin(ids, uv) if len(ids) else None
@@ -314,13 +316,13 @@ class Online:
                 self.lost_since = timestamp
                 self.counts.lost += 1
             away = timestamp - self.lost_since
-            if away > _LOST and len(ids) >= _POINTS_AGAIN // 2:
+            if away > _MAX_LOST_S and len(ids) >= _NUM_RELOCALISATION_POINTS // 2:
                 self._new_map()
                 return "starting"
             return "lost"
         self.lost_since = None
         self._take(timestamp, T_WC, ids, uv, people)
-        if gray is not None and timestamp - self.last_place >= _PLACE_EVERY:
+        if gray is not None and timestamp - self.last_place >= _KEYFRAME_INTERVAL_S:
             self.follower.remember(self.map.points)
             self.last_place = timestamp
         return "tracking"
@@ -328,10 +330,11 @@ class Online:
     def _find_again(
         self, timestamp: float, gray: np.ndarray | None
     ) -> np.ndarray | None:
-        """The camera by the places that are remembered; points to go on with."""
+        """Returns the camera's pose by relocalisation, and adds points to be tracked;
+        `None` if it fails."""
         if gray is None or self.lost_since is None:
             return None
-        if self.counts.frames % _RELOCATE_EVERY:
+        if self.counts.frames % _RELOCALISATION_INTERVAL:
             return None
         found = self.follower.recognise(gray)
         if found is None:
@@ -340,13 +343,13 @@ class Online:
         T_WC = self.map.relocated(points, uv)
         if T_WC is None:
             return None
-        ids = self.follower.add(uv[:_POINTS_AGAIN])
+        ids = self.follower.add(uv[:_NUM_RELOCALISATION_POINTS])
         self.map.points.update(zip(ids.tolist(), points, strict=False))
         self.counts.relocated += 1
         return T_WC
 
     def _new_map(self) -> None:
-        """Ends a map that the camera is lost in, and waits for another one."""
+        """Ends a map in which the camera is lost, and waits for another one."""
         self.warnings[_TWO_MAPS] = None
         self._collect(wait=True)
         self._end_map()
@@ -355,7 +358,8 @@ class Online:
         self._begin_map()
 
     def _feed_waiting(self, poses: list[np.ndarray | None]) -> None:
-        """Frames that came before the map, each once; they were noted without one."""
+        """Adds the frames that came before the map, each once; they were recorded
+        without a pose."""
         rows = list(self.waiting)
         del self.record.frames[len(self.record.frames) - len(rows) + 1 :]
         for row, pose in zip(rows, poses[-len(rows) :], strict=True):
@@ -371,7 +375,7 @@ class Online:
         uv: np.ndarray,
         people: dict[int, np.ndarray],
     ) -> None:
-        """Takes a frame into the record, and those at the window's times into it."""
+        """Adds a frame to the record, and one at a time of the window to the window."""
         located = T_WC is not None
         here = self.map.T_WC if T_WC is None else T_WC
         measured = Measured(timestamp, here, located, ids, uv, people)
@@ -431,18 +435,18 @@ class Online:
     # The window.
 
     def _submit(self, flush: bool) -> None:
-        """Hands the frames that wait to the window, if it has nothing to do."""
+        """Passes the waiting frames to the window, if it is idle."""
         if self.job is not None:
             return
         if flush:
             self.slots.fill(self.map.T_WC)
         count = len(self.slots.waiting) // CHUNK * CHUNK
-        if count > _PENDING and not flush:
-            for slot, measured in self.slots.pop(count - _NEWEST):
+        if count > _MAX_WAITING_FRAMES and not flush:
+            for slot, measured in self.slots.pop(count - _NUM_NEWEST_FRAMES):
                 self.record.pass_over(self.number, slot, measured)
                 self.counts.skipped += measured.located
-            self.window.skip(count - _NEWEST)
-            count = _NEWEST
+            self.window.skip(count - _NUM_NEWEST_FRAMES)
+            count = _NUM_NEWEST_FRAMES
         if not count:
             return
         frames = [measured for _, measured in self.slots.pop(count)]
@@ -454,7 +458,7 @@ class Online:
             self._collect(wait=True)
 
     def _collect(self, wait: bool) -> None:
-        """Takes in what the window has found, if it is there."""
+        """Takes over the solution of the window, if it is ready."""
         if self.job is None or not (wait or self.job.done()):
             return
         windows = self.job.result()
@@ -483,7 +487,7 @@ class Online:
         self.solved = solved
 
     def _end_map(self) -> None:
-        """Solves all that waits."""
+        """Solves all waiting frames."""
         while self.slots.waiting or self.job is not None:
             self._submit(flush=True)
             self._collect(wait=True)

@@ -1,5 +1,5 @@
-"""All programs of a running estimate are compiled, on an invented scene, before there
-is a video."""
+"""Compiles all programs of a running estimate on a synthetic scene, before the
+video."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,9 +17,9 @@ from bodyslam_jax.people.filter import PersonFilter
 from bodyslam_jax.pipeline.to_metric import sole_height
 from bodyslam_jax.types import Intrinsics
 
-_POINTS = 120
-_SPEED = 0.03
-"""Map units a frame."""
+_NUM_POINTS = 120
+_CAMERA_SPEED = 0.03
+"""Speed of the camera, map units a frame."""
 
 
 def compile_all(
@@ -31,7 +31,8 @@ def compile_all(
     step: float,
     places: int,
 ) -> None:
-    """Runs what an estimate runs: a window that moves on, and a person who is followed.
+    """Runs every program of an estimate: a window that moves on, and the filter of a
+    person.
 
     **Arguments:** `fps` of the video; `step` between frames of the window, s; `places`
     for people in it.
@@ -53,14 +54,15 @@ def compile_all(
 def _invented(
     intrinsics: Intrinsics, body: BodyModel, step: float
 ) -> tuple[list[Measured], Float[np.ndarray, "25 3"]]:
-    """Frames of a camera that passes points and a person who stands, as many as let a
-    window move on once, and the person's keypoints in one of them."""
+    """Returns frames of a synthetic scene: a camera that passes points and a standing
+    person, with enough frames for the window to move on once; and the person's
+    keypoints in the last frame."""
     rng = np.random.default_rng(0)
     middle = (intrinsics.width / 2, intrinsics.height / 2)
-    uv = rng.uniform(0.1, 1.9, (_POINTS, 2)) * middle
-    depth = rng.uniform(2.0, 6.0, _POINTS)
+    uv = rng.uniform(0.1, 1.9, (_NUM_POINTS, 2)) * middle
+    depth = rng.uniform(2.0, 6.0, _NUM_POINTS)
     rays = (uv - intrinsics.params[2:4]) / intrinsics.params[:2]
-    places = np.column_stack([rays, np.ones(_POINTS)]) * depth[:, None]
+    places = np.column_stack([rays, np.ones(_NUM_POINTS)]) * depth[:, None]
     dtype = body.joint_template.dtype
     zero = jnp.zeros((23, 3), dtype), jnp.zeros(10, dtype)
     standing = np.asarray(local_keypoints(body, *zero, "body25"), float)
@@ -68,10 +70,10 @@ def _invented(
     frames, points = [], np.ones((25, 3))
     for k in range(FRAMES):
         T_WC = np.eye(4)
-        T_WC[0, 3] = _SPEED * k
+        T_WC[0, 3] = _CAMERA_SPEED * k
         seen = project_points(intrinsics, places - T_WC[:3, 3])
         points[:, :2] = project_points(intrinsics, standing - T_WC[:3, 3])
-        ids = np.arange(_POINTS) + 1000 * (k // 20)
+        ids = np.arange(_NUM_POINTS) + 1000 * (k // 20)
         measured = seen + 0.3 * rng.standard_normal(seen.shape)
         one = k * step, T_WC, True, ids, measured, {0: points.copy()}
         frames.append(Measured(*one))

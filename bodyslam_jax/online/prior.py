@@ -1,4 +1,5 @@
-"""What a window does to its prior beside solving: padding, a walk of s, people who go.
+"""Changes of a window's prior between solves: padding, process noise of s, people who
+leave.
 
 The prior is `½ |W (x ⊖ x̂) + b|²` (`graph.MarginalPrior`), or in information form
 `½ δ^T Λ δ + η^T δ` of the step δ from x̂, with `Λ = W^T W` and `η = W^T b`.
@@ -15,11 +16,11 @@ from bodyslam_jax.geometry.lengths import put
 from bodyslam_jax.solver.marginalisation import square_root
 
 POSTURE = 69
-"""Coordinates of a posture."""
+"""Number of coordinates of a posture."""
 
 
 def no_prior(state: graph.State, frames: int, reach: int) -> graph.MarginalPrior:
-    """A prior without information on the first `frames` frames of a state."""
+    """Returns a prior without information on the first `frames` frames of a state."""
     estimate = _first_frames(state, frames)
     size = len(_places(estimate, reach).order)
     dtype = state.scale.dtype
@@ -34,8 +35,8 @@ def no_prior(state: graph.State, frames: int, reach: int) -> graph.MarginalPrior
 
 
 def with_scale(prior: graph.MarginalPrior, sigma: float) -> graph.MarginalPrior:
-    """A prior without information that is to know s, as it is in its estimate; NaN
-    where s is not known."""
+    """Returns the prior, which has no information on s, with s at its estimate and this
+    standard deviation; unchanged if `sigma` is NaN."""
     if np.isnan(sigma):
         return prior
     root = np.array(prior.root)
@@ -46,8 +47,9 @@ def with_scale(prior: graph.MarginalPrior, sigma: float) -> graph.MarginalPrior:
 def padded(
     prior: graph.MarginalPrior, state: graph.State, frames: int
 ) -> graph.MarginalPrior:
-    """The same prior as one of the first `frames` frames of a state, so that every
-    window has one of the same shape. Of the frames that are added it knows nothing.
+    """Returns the prior as one of the first `frames` frames of a state, so that all
+    windows have priors of one shape. It has no information on the frames that are
+    added.
 
     `state` is that at which the prior was made, from its first frame on.
     """
@@ -76,7 +78,8 @@ def padded(
 def with_walk_of_scale(
     prior: graph.MarginalPrior, variance: float
 ) -> graph.MarginalPrior:
-    """The prior after s has moved by an unknown amount of this variance.
+    """Returns the prior after a random step of s with this variance (prediction step of
+    a random walk).
 
     `Λ' = Λ - Λ e (1/q + e^T Λ e)^-1 e^T Λ` is `(Λ^-1 + q e e^T)^-1`, also where Λ has
     no inverse; the mean stays.
@@ -92,8 +95,8 @@ def with_walk_of_scale(
 
 
 def without_person(prior: graph.MarginalPrior, h: int) -> graph.MarginalPrior:
-    """The prior with the coordinates of person `h` marginalised: it knows nothing of
-    the next person in that place."""
+    """Returns the prior with the coordinates of person `h` marginalised: it has no
+    information on the next person in that slot."""
     places = _places(prior.estimate, prior.reach)
     gone = places.of_person(h)
     matrix, slope = information(prior)
@@ -110,7 +113,7 @@ def without_person(prior: graph.MarginalPrior, h: int) -> graph.MarginalPrior:
 def information(
     prior: graph.MarginalPrior,
 ) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]:
-    """Λ and η."""
+    """Returns Λ and η."""
     root, offset = np.asarray(prior.root), np.asarray(prior.offset)
     return root.T @ root, root.T @ offset
 
@@ -127,7 +130,8 @@ def _of_information(
 
 @dataclasses.dataclass(frozen=True)
 class _Places:
-    """Where in a prior's coordinates what stands (`marginal_prior.coordinates`)."""
+    """Indices of the variables in a prior's coordinates
+    (`marginal_prior.coordinates`)."""
 
     head: Int[np.ndarray, " a"]
     """Scale, intrinsics, named globals and shapes."""
@@ -142,7 +146,7 @@ class _Places:
         return np.concatenate([self.head, self.cameras, self.tail])
 
     def of_person(self, h: int) -> Int[np.ndarray, " k"]:
-        """Shape, roots and posture of one person."""
+        """Returns the indices of shape, roots and posture of one person."""
         shapes = self.head[len(self.head) - 10 * self.people :].reshape(-1, 10)
         roots = 6 * self.reach
         split = self.people * roots

@@ -1,8 +1,9 @@
-"""What is remembered of a running video, and the result that is made of it at the end.
+"""The record of a running video, and the result that is made of it at the end.
 
-Of every frame: its time, where it is relative to a frame of the window, and people's
-keypoints; of the frames of the window, as they leave it: camera, roots and postures. No
-image is kept. Half a kilobyte a frame, one more for each person.
+For every frame it keeps the time, the pose relative to a frame of the window, and
+people's keypoints; for the frames of the window, as they leave it: camera, roots and
+postures. No image is kept. It takes half a kilobyte a frame, and one more for each
+person.
 """
 
 import dataclasses
@@ -24,8 +25,8 @@ from bodyslam_jax.types import (
     Tracks,
 )
 
-_MOST_LANDMARKS = 20_000
-"""Landmarks that are kept for the result."""
+_MAX_LANDMARKS = 20_000
+"""Largest number of landmarks in the result."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,11 +36,11 @@ class Seen:
     time: float
     """s"""
     map: int
-    """Number of its map; -1 before the first."""
+    """Number of its map; -1 before the first map."""
     slot: int
-    """The frame of the window that it is or follows."""
+    """Number of the window's frame that it is or follows."""
     since: Float[np.ndarray, "4 4"]
-    """From its camera to that frame's, map units."""
+    """Transform from its camera to that of the window's frame, map units."""
     located: bool
     people: dict[int, Float[np.ndarray, "25 3"]]
 
@@ -50,7 +51,7 @@ class Slot:
 
     time: float
     T_WC: Float[np.ndarray, "4 4"]
-    """Map units."""
+    """Camera to map, map units."""
     located: bool
     people: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
     """T_CH, θ and contacts."""
@@ -58,20 +59,20 @@ class Slot:
 
 @dataclasses.dataclass
 class Counts:
-    """What happened, for the notes of the result."""
+    """Counts of events, for the warnings of the result."""
 
     frames: int = 0
-    """Used."""
+    """Number of frames that were used."""
     late: int = 0
-    """With a time that is not after that of the one before."""
+    """Number of frames whose time is not after that of the one before."""
     lost: int = 0
-    """How often the camera fitted the map nowhere."""
+    """How often the camera could not be located in the map."""
     relocated: int = 0
     skipped: int = 0
-    """Frames that the window did not get."""
+    """Number of frames that were not passed to the window."""
 
     def notes(self) -> list[str]:
-        """What to know about the result, a line each."""
+        """Returns warnings about the result, one line each."""
         notes = []
         if self.late:
             notes.append(f"{self.late} frames came late or twice and were not used")
@@ -88,22 +89,22 @@ class Counts:
 
 
 class Record:
-    """Frames, and what is known of the maps that they are in."""
+    """The frames, and the state of the maps that they are in."""
 
     def __init__(self) -> None:
         self.frames: list[Seen] = []
         self.slots: dict[tuple[int, int], Slot] = {}
-        """By map and frame of the window."""
+        """Frames of the window, by map and number."""
         self.scales: dict[int, list[tuple[int, float, float]]] = {}
-        """By map: number of a frame, s and its standard deviation then."""
+        """By map: number of a frame, and s and its standard deviation there."""
         self.landmarks: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
-        """By map and track: a frame of the window that saw it, and map units."""
+        """By map and track: a frame that observed it, and its position, map units."""
         self.shapes: dict[int, np.ndarray] = {}
         self.pixel_sigma = 0.7
 
     def keep(self, number: int, solved: Solved) -> None:
-        """Keeps the frames of a window of map `number`, in place of what an earlier
-        window had of them."""
+        """Keeps the frames of a window of map `number`; they replace those of an
+        earlier window."""
         first = solved.first
         # Copies: a row of an array would keep all of it.
         for k in range(CHUNK, len(solved.times)):
@@ -128,21 +129,21 @@ class Record:
         told = first + len(solved.times) - 1, solved.scale, solved.scale_sigma
         self.scales.setdefault(number, []).append(told)
         for track, place in solved.landmarks.items():
-            if len(self.landmarks) < _MOST_LANDMARKS:
+            if len(self.landmarks) < _MAX_LANDMARKS:
                 self.landmarks[number, track] = told[0], place.copy()
 
     def pass_over(self, number: int, slot: int, measured: Measured) -> None:
-        """Keeps the camera of a frame that the window does not get."""
+        """Keeps the camera of a frame that is not passed to the window."""
         given = measured.time, measured.T_WC, measured.located, {}
         self.slots[number, slot] = Slot(*given)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Path:
-    """The frames of the windows of all maps in one metric world."""
+    """Frames of the windows of all maps in one metric world."""
 
     T_WC: dict[tuple[int, int], Float[np.ndarray, "4 4"]]
-    """By map and frame of the window, m."""
+    """Camera poses by map and frame of the window, m."""
     scale: dict[tuple[int, int], float]
     """m per map unit, by map and frame of the window."""
 
@@ -150,8 +151,9 @@ class _Path:
 def smoothed_scales(
     told: list[tuple[int, float, float]], fps: float
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], float]:
-    """s of each window that had one, by all windows (Rauch, Tung, Striebel, 1965), and
-    the standard deviation of the last; s = 1 and NaN if none had.
+    """Returns s of each window that estimated it, smoothed over all windows (Rauch,
+    Tung, Striebel, 1965), and the standard deviation of the last; s = 1 and NaN if none
+    did.
 
     s is a random walk between windows, as in `window`.
     """
@@ -174,8 +176,8 @@ def parts_of(
     fps: float,
     warnings: tuple[str, ...],
 ) -> tuple[Sequence, SfmResult, JointEstimate]:
-    """All frames as the stages of an offline run hand them on: what was measured, the
-    cameras, and the estimate; `fps` is that of the frames of the window."""
+    """Returns all frames as the stages of an offline run pass them on: measurements,
+    cameras, and the joint estimate; `fps` is the rate of the window's frames."""
     path = _path(record, fps)
     told = record.scales[max(record.scales)] if record.scales else []
     _, scales, sigma = smoothed_scales(told, fps)
@@ -240,7 +242,8 @@ def parts_of(
 
 
 def _path(record: Record, fps: float) -> _Path:
-    """Windows' frames in metres; frames that were not located are between others."""
+    """Returns the windows' frames in metres; frames that were not located are
+    interpolated."""
     poses, scale_at = {}, {}
     end = np.eye(4)
     for number in sorted(record.scales):
@@ -269,7 +272,7 @@ def _path(record: Record, fps: float) -> _Path:
 def _cameras(
     record: Record, path: _Path
 ) -> tuple[Float[np.ndarray, "t 4 4"], Bool[np.ndarray, " t"]]:
-    """T_WC of every frame, m, and which were located."""
+    """Returns T_WC of every frame, m, and which were located."""
     T_WC = np.tile(np.eye(4), (len(record.frames), 1, 1))
     located = np.zeros(len(record.frames), bool)
     for t, frame in enumerate(record.frames):
@@ -289,7 +292,8 @@ def _cameras(
 def _placed(
     record: Record, path: _Path, key: tuple[int, int], place: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, " 3"]:
-    """A landmark in the one world, m, as a camera of that time saw it."""
+    """Returns the position of a landmark in the metric world, m, relative to the
+    window's frame that observed it."""
     T = record.slots[key].T_WC
     p_C = T[:3, :3].T @ (place - T[:3, 3]) * path.scale[key]
     return path.T_WC[key][:3, :3] @ p_C + path.T_WC[key][:3, 3]
@@ -313,8 +317,8 @@ def _people(
     Bool[np.ndarray, "h t"],
     Float[np.ndarray, "h t 4"],
 ]:
-    """Roots, postures, presence and contacts in every frame, between the frames of the
-    windows."""
+    """Returns roots, postures, presence and contacts in every frame, interpolated
+    between the frames of the windows."""
     shape = len(persons), len(record.frames)
     roots = np.tile(np.eye(4), (*shape, 1, 1))
     poses, present = np.zeros((*shape, 23, 3)), np.zeros(shape, bool)

@@ -1,8 +1,8 @@
-"""Frames at the rate of the window, and those of them that wait for it.
+"""Frames at the rate of the window, and the queue of those that wait for it.
 
-The window has a frame every `step` seconds, a *slot*. The frame of the video that is
-nearest to its time is in it; others lie between slots. A slot that no frame came for is
-empty, and its camera is between others if the gap is short.
+The window has a frame every `step` seconds, a *slot*. It contains the frame of the
+video that is nearest in time; others lie between slots. A slot without a frame is
+empty, and its camera is interpolated if the gap is short.
 """
 
 import dataclasses
@@ -13,15 +13,15 @@ from jaxtyping import Float
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.online.window_content import FRAMES, Measured, between
 
-_BRIDGED = 2
-"""Most slots in a row that are taken for located without an image."""
+_MAX_GAP_SLOTS = 2
+"""Longest gap whose slots count as located, in slots."""
 
 
 class Slots:
     """The slots of one map."""
 
     def __init__(self, step: float) -> None:
-        """**Arguments:** `step` between slots, s."""
+        """**Arguments:** `step`: time between slots, s."""
         self.step = step
         self.waiting: list[tuple[int, Measured]] = []
         self.front: dict[int, Float[np.ndarray, "4 4"]] = {}
@@ -30,10 +30,10 @@ class Slots:
         self.next, self.first_time = 0, 0.0
 
     def take(self, frame: Measured) -> tuple[int, Float[np.ndarray, "4 4"], float]:
-        """Takes the next frame of the video in.
+        """Adds the next frame of the video.
 
-        **Returns:** the last slot, the camera of the frame from that of the slot (map
-        units), and for how long no frame came where that was long, else 0 (s).
+        **Returns:** the last slot, the pose of the frame's camera relative to that of
+        the slot (map units), and the duration of a long gap before it, else 0 (s).
         """
         if self.next == 0:
             self.first_time = frame.time
@@ -43,7 +43,7 @@ class Slots:
             stood = gap * self.step
             self.first_time += (gap - FRAMES) * self.step
             slot -= gap - FRAMES
-        if 0 < slot - self.next <= _BRIDGED and frame.located:
+        if 0 < slot - self.next <= _MAX_GAP_SLOTS and frame.located:
             # Frames that the source, or a slow machine, left out.
             ends = np.array([self.next - 1, slot])
             poses = np.array([self.front[self.next - 1], frame.T_WC])
@@ -64,8 +64,8 @@ class Slots:
             self._put(self._empty(T_WC))
 
     def pop(self, count: int) -> list[tuple[int, Measured]]:
-        """The oldest that wait, with poses in the map as it is now: it may have been
-        corrected since they came."""
+        """Removes and returns the oldest waiting frames, with their poses in the
+        current map, which may have been corrected since they were added."""
         found = [
             (slot, dataclasses.replace(frame, T_WC=self.front[slot]))
             for slot, frame in self.waiting[:count]
@@ -74,15 +74,15 @@ class Slots:
         return found
 
     def move(self, move: Float[np.ndarray, "4 4"]) -> None:
-        """The map was moved as a whole."""
+        """Moves all frames after a transform of the whole map."""
         self.front = {slot: move @ T for slot, T in self.front.items()}
 
     def forget(self, first: int) -> None:
-        """Drops first poses of slots before this one."""
+        """Drops the first poses of slots before this one."""
         self.front = {slot: T for slot, T in self.front.items() if slot >= first}
 
     def _empty(self, T_WC: Float[np.ndarray, "4 4"]) -> Measured:
-        """The next slot without a frame."""
+        """Returns the next slot without a frame."""
         none = np.zeros(0, int), np.zeros((0, 2))
         at = self.first_time + self.next * self.step
         return Measured(at, T_WC, False, *none, {})

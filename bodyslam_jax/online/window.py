@@ -1,4 +1,5 @@
-"""The fixed-lag window: solves the graph over the last frames, and lets old ones go.
+"""The fixed-lag window: solves the graph over the last frames and marginalises old
+ones.
 
 When the window is full, `solver.marginalise` puts its oldest measured chunk into the
 prior, and it moves on by ten frames.
@@ -23,28 +24,28 @@ from bodyslam_jax.online.window_content import FRAMES, PRIOR, Content, Measured
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.pipeline.motion_prediction import contact_probability
 
-_FIRST_STEPS, _STEPS = 15, 4
-"""Steps of a window's solve: the first with a scale, and all others."""
+_NUM_FIRST_STEPS, _NUM_STEPS = 15, 4
+"""Steps of a window's solve: of the first one with a scale, and of all others."""
 SCALE_WALK = 0.005
 """Relative standard deviation by which the unit of the map changes in a second: what a
 monocular map drifts by on simulated tracks (`benchmarks/online.md`)."""
-_LEAST_ROWS = 100
-"""Observations by which the noise of the tracks is measured."""
+_MIN_OBSERVATIONS = 100
+"""Least number of observations from which the noise of the tracks is estimated."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Solved:
-    """A window after its solve: `t` frames, `h` places for people."""
+    """A window after its solve: `t` frames, `h` slots for people."""
 
     first: int
     """Number of its first frame; frames of a map count from 0, and the past of the
     first window is before it."""
     times: Float[np.ndarray, " t"]
     T_WC: Float[np.ndarray, "t 4 4"]
-    """Map units."""
+    """Camera to map, map units."""
     located: Bool[np.ndarray, " t"]
     people: tuple[int | None, ...]
-    """Who is in each place."""
+    """Number of the person in each slot."""
     present: Bool[np.ndarray, "h t"]
     roots: Float[np.ndarray, "h t 4 4"]
     """T_CH, m."""
@@ -53,13 +54,14 @@ class Solved:
     scale: float
     """m per map unit."""
     scale_sigma: float
-    """NaN as long as nobody told it."""
+    """Standard deviation of `scale`; NaN as long as the scale is unknown."""
     landmarks: dict[int, Float[np.ndarray, " 3"]]
-    """Map units, by the number of the track."""
+    """Positions of landmarks, map units, by the number of the track."""
     contacts: Float[np.ndarray, "h t 4"]
-    """Probability that left toe, left heel, right toe, right heel stand."""
+    """Probability that left toe, left heel, right toe, right heel are in contact with
+    the ground."""
     seconds: dict[str, float]
-    """Of the parts of this step."""
+    """Duration of each part of this step, s."""
 
 
 class Window(Content):
@@ -94,8 +96,8 @@ class Window(Content):
         return [*solved, self._solve(clock)]
 
     def skip(self, frames: int) -> None:
-        """Goes on as many frames later, in the same map: nothing is known of cameras,
-        landmarks and postures there, but people and s are as they were."""
+        """Resumes after a gap of so many frames, in the same map: cameras, landmarks
+        and postures of the gap are unknown, people and s are kept."""
         self.prior = None
         people = list(self.people)
         told = self.steps_told, self.ground_told, self.pixel_sigma
@@ -111,13 +113,13 @@ class Window(Content):
         self.scale, self.scale_sigma = scale, (variance + walked) ** 0.5
 
     def _solve(self, clock: "_Clock") -> Solved:
-        """Solves the window as it is."""
+        """Solves the window with its current frames."""
         sequence, state, roots = window_problem.start(self)
         clock("start")
         problem, state, told = window_problem.make(self, sequence, state, roots)
         clock("factors")
         first = np.isnan(self.scale_sigma)
-        steps = _FIRST_STEPS if first else _STEPS
+        steps = _NUM_FIRST_STEPS if first else _NUM_STEPS
         stage = solver.Stage(max_steps=steps, rtol=1e-4, atol=0.01)
         solution = solver.solve(problem, state, schedule=(stage,))
         state = solution.state
@@ -134,7 +136,7 @@ class Window(Content):
     def _measure(
         self, problem: graph.Problem, state: graph.State, metric: bool
     ) -> None:
-        """Standard deviation of s by the window's posterior."""
+        """Updates the standard deviation of s from the window's posterior."""
         if not metric:
             return
         spread = solver.marginals(problem, state)
@@ -187,9 +189,9 @@ class Window(Content):
     def _measure_pixels(
         self, tracks: graph.Reprojection, places: Float[np.ndarray, "l 3"]
     ) -> None:
-        """Noise of the tracks, by the residuals."""
+        """Updates the noise of the tracks from the residuals."""
         frame, landmark = np.asarray(tracks.frame), np.asarray(tracks.landmark)
-        if len(frame) < _LEAST_ROWS:
+        if len(frame) < _MIN_OBSERVATIONS:
             return
         T_WC = self.cameras[frame]
         p_C = np.einsum(
@@ -254,7 +256,7 @@ class Window(Content):
 
 @eqx.filter_jit
 def _prediction(predictor: graph.MotionPredictor, state: graph.State) -> object:
-    """As `Problem.predict`."""
+    """Returns the prediction as `Problem.predict` does, compiled."""
     found = predictor(state)
     return {
         "translation": found.translation,
@@ -274,7 +276,7 @@ def _ground_of(problem: graph.Problem) -> graph.GroundContact:
 
 
 class _Clock:
-    """Durations of parts, one after another."""
+    """Durations of consecutive parts."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

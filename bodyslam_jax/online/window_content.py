@@ -1,10 +1,10 @@
-"""What is in the window: the last frames, who is in them, landmarks and what is known.
+"""The content of the window: its frames, people, landmarks and what is known of them.
 
-`FRAMES` frames in chunks of ten. The first chunk is the past, whose measurements are in
-the prior; the others are measured. All arrays have one size.
+The window has `FRAMES` frames in chunks of ten. The first chunk is the past, whose
+measurements are in the prior; the others are measured. All arrays have one size.
 
-Landmarks live for `LIFE` chunks at most; a longer track continues as another landmark.
-So a prior couples `PRIOR` frames, whatever the tracks.
+Landmarks span `LIFE` chunks at most; a longer track continues as another landmark. So a
+prior couples `PRIOR` frames, whatever the tracks.
 """
 
 import dataclasses
@@ -21,41 +21,44 @@ from bodyslam_jax.online import prior as priors
 from bodyslam_jax.types import Intrinsics
 
 FRAMES = 60
-"""Frames of a window, the first ten of them the past: a size that programs have."""
+"""Frames of a window, the first ten of them the past; the solver has programs of this
+size."""
 LIFE = 3
-"""Most chunks that a landmark spans: narrow tables of the solver."""
+"""Largest number of chunks that a landmark spans, so that the solver's tables are
+narrow."""
 PRIOR = (LIFE + 1) * CHUNK
-"""Frames that the prior is of: the past, and what landmarks of the chunk that leaves
-reach."""
-_SIGMA = 0.7
-"""px: noise of tracks before it was measured."""
-_AWAY = 10
-"""Frames without keypoints after which a person's place is free for somebody else."""
-_POINTS = 150
-"""Most observations of a frame that are in the graph."""
+"""Frames of the prior: the past, and those that landmarks of the leaving chunk
+observe."""
+_INITIAL_SIGMA_PX = 0.7
+"""Noise of tracks until it is estimated, px."""
+_MAX_UNSEEN_FRAMES = 10
+"""Frames without keypoints after which a person's slot is free for another person."""
+_MAX_OBSERVATIONS = 150
+"""Largest number of observations of a frame that are in the graph."""
 _NOTHING = np.zeros(0, int), np.zeros((0, 2))
 
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """What the front end found in one frame."""
+    """The measurements of the front end in one frame."""
 
     time: float
-    """s; within half a step of the window's rate from where it stands in it."""
+    """Time, s; within half a step of the window's rate from its nominal time in the
+    window."""
     T_WC: Float[np.ndarray, "4 4"]
-    """Map units; a guess where not `located`."""
+    """Camera to map, map units; a guess where not `located`."""
     located: bool
-    """Also of a frame without an image, between others: its ids are empty."""
+    """True also of an interpolated frame without an image, whose ids are empty."""
     ids: Int[np.ndarray, " n"]
-    """Of the tracks."""
+    """Numbers of the tracks."""
     uv: Float[np.ndarray, "n 2"]
-    """px"""
+    """Pixels of the tracks, px."""
     people: dict[int, Float[np.ndarray, "25 3"]]
     """Keypoints (u px, v px, confidence) by person."""
 
 
 class Content:
-    """The last frames of one map, and who is in them."""
+    """The last frames of one map, and the people in them."""
 
     def __init__(
         self,
@@ -65,13 +68,14 @@ class Content:
         fps: float,
         places: int,
     ) -> None:
-        """**Arguments:** `fps` of the window's frames; `places` for people."""
+        """**Arguments:** `fps`: rate of the window's frames, 1/s; `places`: number of
+        slots for people."""
         self.intrinsics, self.body, self.config = intrinsics, body, config
         self.fps, self.places = fps, places
         self.count = 0
-        """Measured frames in the window, after the past."""
+        """Number of measured frames in the window, after the past."""
         self.solved_until = -CHUNK
-        """The first frame that no solve has seen."""
+        """Number of the first frame that was in no solve."""
         self.first = self.start = -CHUNK
         """Number of its first frame, now and at first; frames of the map count from 0.
         """
@@ -86,35 +90,35 @@ class Content:
         self.roots = np.tile(np.eye(4), (places, FRAMES, 1, 1))
         self.poses = np.zeros((places, FRAMES, 23, 3))
         self.known = np.zeros((places, FRAMES), bool)
-        """Where roots and poses are those of a solve."""
+        """True where roots and poses are those of a solve."""
         self.shapes = np.zeros((places, 10))
         self.people: list[int | None] = [None] * places
         self.began = np.zeros(places, int)
-        """Frame in which each person's shape is measured."""
+        """Number of the frame in which each person's shape is measured."""
         self.book: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        """Shape, and its standard deviations, of people who were here."""
+        """Shapes, and their standard deviations, of people who have left the window."""
         self.scale, self.scale_sigma = 1.0, float("nan")
-        self.pixel_sigma = _SIGMA
+        self.pixel_sigma = _INITIAL_SIGMA_PX
         self.steps_told = np.zeros(places)
         """Information of marginalised steps on their common factor."""
         self.ground_told = 0.0
-        """Marginalised frames with ground."""
+        """Number of marginalised frames with a ground factor."""
         self.prior: graph.MarginalPrior | None = None
         self.where: dict[int, np.ndarray] = {}
-        """Places of landmarks, map units."""
+        """Positions of landmarks, map units."""
         self.life: dict[int, tuple[int, int]] = {}
-        """Of a track: its landmark, and the chunk in which that ends."""
+        """By track: its landmark, and the chunk in which that landmark ends."""
         self.track: dict[int, int] = {}
-        """Of a landmark: its track."""
+        """By landmark: its track."""
         self.landmarks = 0
-        """Their number until now."""
+        """Number of landmarks so far."""
         self.in_graph = np.zeros(0, int)
         """The landmarks of the last problem."""
         self.predictor: graph.MotionPredictor | None = None
         self.stands: graph.MotionPredictor | None = None
 
     def restart(self) -> None:
-        """Forgets the map; people stay in the book."""
+        """Clears the map; the shapes of people are kept in the book."""
         for h in range(self.places):
             self._leave(h)
         book, told = self.book, (self.predictor, self.stands)
@@ -149,8 +153,8 @@ class Content:
             self._fix_gauge()
 
     def _fix_gauge(self) -> None:
-        """The first camera is held, and one coordinate of the farthest of the first
-        window: the unit of the map."""
+        """Fixes the gauge: holds the first camera, and one coordinate of the farthest
+        camera of the first window, which defines the unit of the map."""
         shown = np.array([len(ids) > 0 for ids, _ in self.seen])
         here = CHUNK + np.flatnonzero(shown[CHUNK:])
         if not len(here):
@@ -164,7 +168,7 @@ class Content:
     def _landmarks_of(self, k: int, frame: Measured) -> tuple[np.ndarray, np.ndarray]:
         chunk = (self.first + k) // CHUNK
         order = np.argsort([i not in self.life for i in frame.ids], kind="stable")
-        chosen = np.sort(order[:_POINTS])
+        chosen = np.sort(order[:_MAX_OBSERVATIONS])
         rows = []
         for i in frame.ids[chosen].tolist():
             landmark, end = self.life.get(i, (-1, -1))
@@ -182,11 +186,11 @@ class Content:
         return np.array(rows, int), np.asarray(frame.uv[chosen], float)
 
     def _place_of(self, person: int, k: int) -> int | None:
-        """The person's place from frame `k` on; a new one gets that of somebody who was
-        not seen for a while."""
+        """Returns the person's slot from frame `k` on; a new person gets the slot of
+        one who was not visible for a while, or `None`."""
         if person in self.people:
             return self.people.index(person)
-        recent = slice(max(0, k - _AWAY), k)
+        recent = slice(max(0, k - _MAX_UNSEEN_FRAMES), k)
         gone = [
             h
             for h, other in enumerate(self.people)
@@ -210,7 +214,7 @@ class Content:
         return np.zeros(10) if known is None else known[0]
 
     def _leave(self, h: int) -> None:
-        """Frees a place; what is known of the person's shape goes into the book."""
+        """Frees a slot; the estimate of the person's shape is kept in the book."""
         person = self.people[h]
         if person is None:
             return
@@ -221,7 +225,7 @@ class Content:
         self.people[h] = None
 
     def _bridge(self) -> None:
-        """Puts cameras without an image between those around them."""
+        """Interpolates cameras without an image between those around them."""
         rows = np.arange(CHUNK, CHUNK + self.count)
         shown = np.array([len(self.seen[k][0]) > 0 for k in rows], bool)
         solved = rows[shown]
@@ -232,7 +236,7 @@ class Content:
             self.cameras[missing] = between(solved, self.cameras[solved], missing)
 
     def _shift(self) -> None:
-        """The oldest measured frames become the past; their landmarks go."""
+        """Makes the oldest measured frames the past and removes their landmarks."""
         gone = np.concatenate([s[0] for s in self.seen[CHUNK : 2 * CHUNK]])
         gone = np.unique(gone)
         move = lambda x, axis: np.concatenate(
@@ -260,7 +264,7 @@ class Content:
         self._forget()
 
     def _forget(self) -> None:
-        """Landmarks and tracks that are in no frame any more."""
+        """Removes landmarks and tracks that are in no frame."""
         here = set(np.concatenate([s[0] for s in self.seen]).tolist())
         chunk = (self.first + FRAMES) // CHUNK - 1
         self.life = {
@@ -278,7 +282,8 @@ def between(
     T: Float[np.ndarray, "n 4 4"],
     wanted: Real[np.ndarray, " m"],
 ) -> Float[np.ndarray, "m 4 4"]:
-    """Poses at other times, interpolated; beyond the ends the first and the last."""
+    """Returns poses at other times, interpolated; beyond the ends the first and the
+    last."""
     found = np.tile(np.eye(4), (len(wanted), 1, 1))
     after = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
     before = np.clip(np.searchsorted(known, wanted, side="right") - 1, 0, None)

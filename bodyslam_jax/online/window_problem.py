@@ -1,8 +1,8 @@
-"""The graph's problem over what is in the window.
+"""The graph's problem over the content of the window.
 
-All arrays have one size, so that the solver's programs are compiled once. A factor that
-counts one error once for a whole clip (steps, the ground) gets here what its
-information grows by.
+All arrays have one size, so that the solver's programs are compiled once. A factor
+whose error is common to a whole clip (steps, the ground) enters with the information
+that it adds to that of earlier frames.
 """
 
 import dataclasses
@@ -32,30 +32,30 @@ from bodyslam_jax.types import Keypoints, ScaleStart, Sequence, Tracks
 
 log = logging.getLogger(__name__)
 
-_LEAST_ANGLE = np.radians(0.5)
-"""Parallax from which a landmark is in the graph: ten times the noise of a ray."""
-_LEAST_SEEN = 3
-"""Observations of a landmark in the graph."""
-_OUTLIER = 6.0
-"""Reprojection error of a landmark's median observation from which it is left out, in
-its standard deviation."""
-_LEAST_STEPS = 15
-"""Predicted steps from which s is estimated: about a second."""
-_GROUND_COUNTS = 10.0
-"""Frames with ground that count half as much as all of them."""
+_MIN_PARALLAX_RAD = np.radians(0.5)
+"""Least parallax of a landmark in the graph, rad: ten times the noise of a ray."""
+_MIN_OBSERVATIONS = 3
+"""Least number of observations of a landmark in the graph."""
+_MAX_MEDIAN_ERROR = 6.0
+"""Largest median reprojection error of a landmark in the graph, in its standard
+deviation."""
+_MIN_STEPS = 15
+"""Least number of predicted steps from which s is estimated: about a second."""
+_GROUND_HALF_INFORMATION_FRAMES = 10.0
+"""Number of frames with ground whose information is half that of infinitely many."""
 _DEFINITION = "unknown"
-"""What the detector calls a hip or a knee (`Keypoints.definition`)."""
-_NOWHERE = np.full(3, np.nan)
-_ROOM = 540
-"""Landmarks that the tables of a window hold, partly filled as they are."""
+"""The detector's definition of hip and knee (`Keypoints.definition`)."""
+_UNKNOWN_POSITION = np.full(3, np.nan)
+_MAX_LANDMARKS = 540
+"""Number of landmarks that the tables of a window hold; they are partly filled."""
 _VARIABLES = ("scale", "cameras", "roots", "poses", "shapes", "landmarks")
 
 
 def start(
     window: Content,
 ) -> tuple[Sequence, graph.State, PersonState]:
-    """The window as a sequence, the first state of its solve, and people's bodies
-    as fitted to their keypoints alone."""
+    """Returns the window as a sequence, the first state of its solve, and people's
+    bodies as fitted to their keypoints alone."""
     keypoints = Keypoints(window.uv, window.confidence, _DEFINITION)
     sequence = Sequence(
         name="window",
@@ -84,7 +84,7 @@ def start(
 
 
 def _start_person(window: Content, h: int, roots: PersonState) -> None:
-    """Frames of a person that no solve has moved start at the fit."""
+    """Sets frames of a person that no solve has estimated to the fit."""
     there = roots.present[h]
     there[: CHUNK - 1] &= window.known[h, : CHUNK - 1]
     new = there & ~window.known[h]
@@ -177,7 +177,8 @@ def make(
 def _tracks(
     window: Content,
 ) -> tuple[Tracks, Float[np.ndarray, "l 3"]]:
-    """Observations of the landmarks that are in the graph, and their places."""
+    """Returns the observations of the landmarks that are in the graph, and their
+    positions."""
     frame = np.concatenate([np.full(len(s[0]), k) for k, s in enumerate(window.seen)])
     landmark = np.concatenate([s[0] for s in window.seen]).astype(int)
     uv = np.concatenate([s[1] for s in window.seen])
@@ -187,7 +188,7 @@ def _tracks(
     K, distortion = as_opencv(window.intrinsics.params)
     xy = rays(uv, K, distortion)
     pixel = 1 / K[0, 0]
-    places = np.array([window.where.get(i, _NOWHERE) for i in known.tolist()])
+    places = np.array([window.where.get(i, _UNKNOWN_POSITION) for i in known.tolist()])
     places = places.reshape(-1, 3)
     fresh = np.asarray(np.isnan(places).any(axis=1))
     if fresh.any():
@@ -199,13 +200,13 @@ def _tracks(
     away = np.linalg.norm(
         p_C[:, :2] / np.where(front, depth, 1.0)[:, None] - xy, axis=1
     )
-    limit = _OUTLIER * window.pixel_sigma * pixel
+    limit = _MAX_MEDIAN_ERROR * window.pixel_sigma * pixel
     off = np.bincount(row, np.logical_or(~front, away > limit), len(known)) / seen
-    good = (seen >= _LEAST_SEEN) & (off < 0.5)
-    good &= widest_angle(centre, row, places) > _LEAST_ANGLE
+    good = (seen >= _MIN_OBSERVATIONS) & (off < 0.5)
+    good &= widest_angle(centre, row, places) > _MIN_PARALLAX_RAD
     for i in known[~good]:
         window.where.pop(int(i), None)
-    good = _most(good, seen, _ROOM)
+    good = _most(good, seen, _MAX_LANDMARKS)
     rows = np.flatnonzero(good[row])
     number = np.cumsum(good) - 1
     window.in_graph = known[good]
@@ -215,8 +216,8 @@ def _tracks(
 def _shape_once(
     window: Content, factor: graph.ShapePrior, roots: PersonState
 ) -> graph.ShapePrior:
-    """One measurement of each person's shape: the fit in their first frame here, or
-    what the book has of them."""
+    """Returns one measurement of each person's shape: the fit in their first frame of
+    the window, or the shape in the book."""
     sigma = np.full(np.shape(factor.sigma), np.inf)
     shape = np.array(factor.shape)
     for h, person in enumerate(window.people):
@@ -237,7 +238,8 @@ def _shape_once(
 def _steps_once(
     window: Content, moved: graph.HumanMotion, measured: np.ndarray
 ) -> tuple[graph.HumanMotion, Float[np.ndarray, "h t"]]:
-    """Steps with the weight by which they add to those before.
+    """Returns the motion factor, weighted by the information that its steps add to
+    those before.
 
     With an error e common to all steps, information I on their factor is worth
     `I / (1 + e² I)`. What it grows by from I_0 to I_0 + I is the weight
@@ -268,8 +270,8 @@ def _ground(
     steps: Prediction,
     measured: np.ndarray,
 ) -> tuple[graph.GroundContact, graph.State]:
-    """The factor of people on the ground of the map, and the state with a first
-    scale if it has none yet and there is something that tells it."""
+    """Returns the factor of people on the ground of the map, and the state, with a
+    first scale if it has none yet and a cue determines it."""
     weights = window.config.weights
     blank = graph.GroundContact(
         window.body,
@@ -287,7 +289,7 @@ def _ground(
         contact = initialisation.with_wander(contact, state, window.fps)
     if np.isnan(window.scale_sigma):
         start = ScaleStart()
-        if np.asarray(steps.valid)[:, CHUNK:].sum() >= _LEAST_STEPS:
+        if np.asarray(steps.valid)[:, CHUNK:].sum() >= _MIN_STEPS:
             start = initialisation.scale_start(
                 state, steps, contact, shared_error=weights.fitted_step_error
             )
@@ -299,7 +301,7 @@ def _ground(
     sigma = np.asarray(contact.sigma)
     used = np.isfinite(sigma)
     count, told = float(used.sum()), window.ground_told
-    share = lambda n: n / (_GROUND_COUNTS + n)
+    share = lambda n: n / (_GROUND_HALF_INFORMATION_FRAMES + n)
     grown = max(share(told + count) - share(told), 1e-9)
     # `sigma` is that of all frames together times the root of their number.
     sigma = sigma / np.sqrt(count) * np.sqrt(count / grown)
@@ -307,7 +309,8 @@ def _ground(
 
 
 def _most(good: np.ndarray, seen: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of the good ones, those that are seen most."""
+    """Returns at most so many of the good landmarks, those with the most
+    observations."""
     if good.sum() <= most:
         return good
     order = np.argsort(np.where(good, -seen, 0), kind="stable")
