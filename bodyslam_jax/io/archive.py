@@ -18,14 +18,14 @@ from bodyslam_jax.io import budget
 from bodyslam_jax.io.declared import Fields, Shape, Sizes, as_array, fields
 from bodyslam_jax.io.files import open_binary, parse_json, read_zip, reading
 
-_BLOCK = 1 << 22
+_BLOCK_BYTES = 1 << 22
 """Bytes that are unpacked at a time."""
-_HEADER_BYTES = 10_000
-"""Bytes of the header of a `.npy`, at most: those of plain arrays have 128."""
-_PLAIN = "biufcSU"
+_MAX_HEADER_BYTES = 10_000
+"""Largest size of the header of a `.npy`, bytes: those of plain arrays have 128."""
+_PLAIN_KINDS = "biufcSU"
 """Kinds of NumPy's types that hold nothing but values of one size."""
 _MAX_DIGITS = 19
-"""Digits of a length of an axis."""
+"""Largest number of digits of the length of an axis."""
 
 
 class Archive:
@@ -49,7 +49,10 @@ class Archive:
         return name in self.names
 
     def require(self, *names: str) -> None:
-        """**Raises:** `InputError` if an array is not there."""
+        """Checks that the archive has arrays of these names.
+
+        **Raises:** `InputError` if one is missing.
+        """
         missing = [name for name in names if name not in self]
         if missing:
             found = ", ".join(name[:40] for name in self.names[:12])
@@ -58,13 +61,13 @@ class Archive:
             )
 
     def header(self, name: str) -> tuple[tuple[int, ...], np.dtype]:
-        """Shape and type of an array, which is not read."""
+        """Returns shape and type of an array without reading it."""
         self.require(name)
         with self._members.opened(f"{name}.npy") as file:
             return _npy_header(self.path, name, file)[:2]
 
     def raw(self, name: str) -> np.ndarray:
-        """An array as it is, of numbers, of true and false or of text.
+        """Returns an array as it is, of numbers, of true and false or of text.
 
         **Raises:** `InputError`, naming file and array, if it is missing, damaged, or
         holds Python's objects.
@@ -75,13 +78,13 @@ class Archive:
             return _npy(self.path, name, file, self._members.size(member))
 
     def array(self, name: str, *shapes: Shape, **declared: Any) -> np.ndarray:
-        """An array, as `declared.as_array` checks and converts it."""
+        """Returns an array, as `declared.as_array` checks and converts it."""
         return as_array(
             self.path, name, self.raw(name), *shapes, sizes=self._sizes, **declared
         )
 
     def text(self, name: str) -> str:
-        """A single text."""
+        """Returns a single text."""
         found = self.raw(name)
         if found.size == 1 and found.dtype.kind in "SU":
             with contextlib.suppress(ValueError, SystemError):  # no code points
@@ -92,13 +95,13 @@ class Archive:
         )
 
     def json(self, name: str) -> Fields:
-        """The entries of a JSON object in an array of one text."""
+        """Returns the entries of a JSON object in an array of one text."""
         data = parse_json(self.text(name), self.path, f"JSON in `{name}`")
         return fields(self.path, data, name)
 
 
 def read_npz(path: Path, what: str = "a NumPy archive (.npz)") -> Archive:
-    """The arrays of an `.npz`; nothing in it is unpickled.
+    """Returns the arrays of an `.npz`; nothing in it is unpickled.
 
     **Raises:** `InputError` as `read_zip`, or if it holds no arrays.
     """
@@ -106,7 +109,7 @@ def read_npz(path: Path, what: str = "a NumPy archive (.npz)") -> Archive:
 
 
 def read_npy(path: Path, what: str = "a NumPy array (.npy)") -> np.ndarray:
-    """The array of a `.npy`; nothing in it is unpickled.
+    """Returns the array of a `.npy`; nothing in it is unpickled.
 
     **Raises:** `InputError` as `open_binary`, or if it is no array or is damaged.
     """
@@ -115,13 +118,13 @@ def read_npy(path: Path, what: str = "a NumPy array (.npy)") -> np.ndarray:
 
 
 def _npy(path: Path, name: str, file: Any, size: int) -> np.ndarray:
-    """One array in NumPy's format, from a stream of `size` bytes."""
+    """Returns one array in NumPy's format, from a stream of `size` bytes."""
     shape, dtype, is_fortran, used = _npy_header(path, name, file)
     if dtype.kind == "O":
         raise InputError(
             f"{path}: `{name}` is a pickled object, expected a plain array."
         )
-    if dtype.kind not in _PLAIN or dtype.subdtype or not dtype.itemsize:
+    if dtype.kind not in _PLAIN_KINDS or dtype.subdtype or not dtype.itemsize:
         raise InputError(f"{path}: `{name}` holds {dtype}, expected numbers or text.")
     wanted = math.prod(shape) * dtype.itemsize
     if wanted > size - used:
@@ -133,7 +136,7 @@ def _npy(path: Path, name: str, file: Any, size: int) -> np.ndarray:
     content = np.empty(wanted, np.uint8)
     at = 0
     while at < wanted:
-        block = file.read(min(_BLOCK, wanted - at))
+        block = file.read(min(_BLOCK_BYTES, wanted - at))
         if not block:
             raise InputError(
                 f"{path}: `{name}` ends after {at} of {wanted} bytes, expected a whole "
@@ -148,14 +151,14 @@ def _npy(path: Path, name: str, file: Any, size: int) -> np.ndarray:
 def _npy_header(
     path: Path, name: str, file: Any
 ) -> tuple[tuple[int, ...], np.dtype, bool, int]:
-    """Shape, type, whether columns come first, and the header's own bytes."""
+    """Returns shape, type, whether columns come first, and the header's own bytes."""
     magic = file.read(8)
     with reading(path, f"`{name}` in NumPy's format"):
         if len(magic) < 8 or magic[:6] != b"\x93NUMPY" or magic[6] not in (1, 2, 3):
             raise ValueError(f"`{name}` begins with {magic!r}")
         width = 2 if magic[6] == 1 else 4
         length = int.from_bytes(file.read(width), "little")
-        if length > _HEADER_BYTES:
+        if length > _MAX_HEADER_BYTES:
             raise ValueError(f"`{name}` has a header of {length} bytes")
         text = file.read(length).decode("latin1" if magic[6] < 3 else "utf-8")
         match = _HEADER.fullmatch(text)
@@ -185,6 +188,7 @@ _ENTRY = re.compile(r"'(descr|fortran_order|shape)'\s*+:\s*+(" + _VALUE + ")")
 
 
 def _plain_dtype(descr: str) -> np.dtype:
-    """A type by its code, such as `<f8`; any other is one that readers refuse."""
+    """Returns a type by its code, such as `<f8`; for any other code, one that readers
+    refuse."""
     match = re.fullmatch(r"'([<>|=]?)([biufcSUO?])(\d{0,6})'", descr)
     return np.dtype(descr[1:-1]) if match else np.dtype("V1")

@@ -11,13 +11,13 @@ import numpy as np
 from bodyslam_jax.io.video import Footage
 from bodyslam_jax.types import Intrinsics
 
-_SQUARE = 0.01
-"""Difference of a ratio from 1 that counts as none."""
+_ASPECT_TOLERANCE = 0.01
+"""Difference of an aspect ratio from 1 up to which it counts as 1."""
 
 
 def at_size_of(intrinsics: Intrinsics, footage: Footage) -> Intrinsics:
-    """The camera in stored pixels, if it was calibrated in images that a player has
-    stretched to square pixels."""
+    """Returns the camera in stored pixels, if it was calibrated in images that a player
+    has stretched to square pixels; unchanged otherwise."""
     shown = round(footage.width * footage.pixel_aspect), footage.height
     stored = footage.width, footage.height
     if shown == stored or (intrinsics.width, intrinsics.height) != shown:
@@ -30,13 +30,13 @@ def at_size_of(intrinsics: Intrinsics, footage: Footage) -> Intrinsics:
 
 
 def aspect_warnings(intrinsics: Intrinsics, footage: Footage) -> tuple[str, ...]:
-    """Warnings about pixels that are not square."""
+    """Returns warnings about pixels that are not square."""
     declared = footage.pixel_aspect
     used = float(intrinsics.params[1] / intrinsics.params[0])
-    if abs(declared - 1) < _SQUARE:
+    if abs(declared - 1) < _ASPECT_TOLERANCE:
         return ()
     name = footage.path.name
-    if abs(used / declared - 1) < _SQUARE:
+    if abs(used / declared - 1) < _ASPECT_TOLERANCE:
         return (
             f"{name}: pixels {declared:.4g} times as wide as high, by the container: "
             "fx and fy differ by that.",

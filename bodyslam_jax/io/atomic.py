@@ -1,4 +1,4 @@
-"""Files that are complete or not there at all.
+"""Files are written whole or not at all.
 
 What is written goes to a hidden sibling first, which then takes the name asked for in
 one step (`os.replace`). An error or an interruption leaves an earlier file as it was.
@@ -17,7 +17,8 @@ import numpy as np
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A hidden file name beside `path`, which becomes `path` when the block ends well.
+    """Yields a hidden file name beside `path`, which becomes `path` when the block ends
+    without an error.
 
     If the block raises, what it wrote is deleted. The name has the suffix of `path`.
 
@@ -67,7 +68,8 @@ def write_npz(
 
 @contextlib.contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """An error in writing names the file; a full disk's does not by itself."""
+    """Adds the file's name to errors of writing in the block; that of a full disk lacks
+    it."""
     try:
         yield
     except OSError as error:
@@ -77,7 +79,7 @@ def _naming(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def hidden_folder(home: Path, prefix: str = ".partial-") -> Iterator[Path]:
-    """An empty hidden folder in `home`, deleted with its content after the block.
+    """Yields an empty hidden folder in `home`, which is deleted after the block.
 
     `home` and its parents are made if need be, and deleted again if left empty.
     """

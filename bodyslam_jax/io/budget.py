@@ -1,4 +1,4 @@
-"""How much an input may ask for: one budget for everything that is opened.
+"""The budget of inputs: largest sizes of everything that is opened.
 
 Readers ask `current()`; whoever knows the user's settings opens a block with
 `granted(config.limits)`. Outside of one the defaults of `config.Limits` hold.
@@ -25,10 +25,10 @@ MAX_MARKUP_BYTES = 1_000_000
 MAX_PIXELS = 100_000_000
 """Pixels of one image: three times those of 8K video."""
 MAX_MEMBERS = 100_000
-"""Files within an archive."""
+"""Largest number of files within an archive."""
 MAX_PEOPLE = 1000
-"""People in one frame: they are told apart in pairs."""
-SPARSEST = 100
+"""Largest number of people in one frame: they are compared in pairs."""
+MAX_SPARSITY = 100
 """Ratio of the last number to the count of observations above which numbers are no
 frame numbers, but times for example."""
 
@@ -38,13 +38,13 @@ _limits: contextvars.ContextVar[Limits] = contextvars.ContextVar(
 
 
 def current() -> Limits:
-    """The limits that hold here."""
+    """Returns the limits in force."""
     return _limits.get()
 
 
 @contextlib.contextmanager
 def granted(limits: Limits) -> Iterator[None]:
-    """A block in which these limits hold."""
+    """Applies these limits within the block."""
     token = _limits.set(limits)
     try:
         yield
@@ -78,7 +78,8 @@ def check_pixels(path: Path, width: int, height: int) -> None:
 
 
 def last_frame_problem(last: int, observed: int, what: str) -> str | None:
-    """Why `last` cannot be the number of a frame where no video bounds it.
+    """Returns the reason why `last` cannot be the number of a frame where no video
+    bounds it; `None` if it can.
 
     Args:
         observed: number of frames, or of images, that the file tells something of.
@@ -89,7 +90,7 @@ def last_frame_problem(last: int, observed: int, what: str) -> str | None:
             f"{what} of frame {last}, expected less than {current().frames} without a "
             "video (--limits.frames allows more)"
         )
-    if last > SPARSEST * (observed + 10):
+    if last > MAX_SPARSITY * (observed + 10):
         return (
             f"{what} of frame {last}, but of {observed} frames only: no frame numbers"
         )

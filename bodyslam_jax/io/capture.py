@@ -18,10 +18,10 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.video import open_video
 
 _STREAM = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
-_USUAL_FPS = 30.0
-"""Of cameras that do not tell."""
-_FASTEST = 240.0
-"""Rates above it are no rates."""
+_DEFAULT_FPS = 30.0
+"""Frame rate of cameras that do not report it, 1/s."""
+_MAX_FPS = 240.0
+"""Largest plausible frame rate, 1/s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,9 +29,10 @@ class Captured:
     """One image of a source."""
 
     index: int
-    """Number of images before it in the source, dropped ones counted."""
+    """Number of images before it in the source, including dropped ones."""
     timestamp: float
-    """s from the first image; of a file by its rate, else by this machine's clock."""
+    """Time since the first image, s; for a file by its rate, else by the clock of this
+    machine."""
     image: UInt8[np.ndarray, "y x 3"]
     """BGR"""
 
@@ -50,7 +51,7 @@ class Capture:
         self.path = _file(source)
         self.reader = self._open()
         told = float(self.reader.get(cv2.CAP_PROP_FPS) or 0.0)
-        usual = told if 0 < told <= _FASTEST else _USUAL_FPS
+        usual = told if 0 < told <= _MAX_FPS else _DEFAULT_FPS
         self.fps = fps or usual
         ok, first = self.reader.read()
         if not ok or first is None:
@@ -75,8 +76,8 @@ class Capture:
         self._thread.start()
 
     def newest(self, timeout: float) -> Captured | None:
-        """The newest image that nobody has taken; `None` if none comes in `timeout`
-        (s), or ever."""
+        """Returns the newest image that was not returned yet; `None` if none comes
+        within `timeout` (s), or ever."""
         with self._ready:
             there = lambda: self._newest is not None or self.ended
             self._ready.wait_for(there, timeout)
@@ -84,11 +85,11 @@ class Capture:
             return found
 
     def silent(self) -> float:
-        """s since the last image."""
+        """Returns the time since the last image, s."""
         return time.monotonic() - self.last_image
 
     def close(self) -> None:
-        """Ends the thread. One that waits for a camera ends with the process."""
+        """Ends the thread; a thread that waits for a camera ends with the process."""
         self._closed = True
         if self._thread is not None:
             self._thread.join(timeout=1.0)
@@ -136,7 +137,7 @@ class Capture:
 
 
 def _file(source: str) -> Path | None:
-    """The file that a source is; `None` for a camera or a stream.
+    """Returns the file of a source; `None` for a camera or a stream.
 
     **Raises:** `InputError` if it looks like a file and there is none.
     """

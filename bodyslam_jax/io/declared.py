@@ -1,4 +1,4 @@
-"""What a reader needs of a file, declared: rank, type, range and finiteness.
+"""Declarations of what a reader needs of a file: rank, type, range and finiteness.
 
 A reader says what it needs of each value before code of its own runs on it, and what
 differs is one line: the file, the place, what was found, what was expected.
@@ -15,7 +15,8 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import budget
 
 MAX_MAGNITUDE = 1e12
-"""Largest number of a measurement. Its square times a million still fits float32."""
+"""Largest absolute value of a measurement. Its square times a million still fits
+float32."""
 Kind = Literal["number", "whole", "boolean"]
 Shape = Sequence[int | str | None]
 """Length of each axis: a number, a name that stands for the same number throughout a
@@ -23,7 +24,7 @@ file, or `None` for any. A first entry of `...` is not needed: give several shap
 
 
 class Sizes(dict[str, int]):
-    """The lengths that names of axes stand for in one file."""
+    """The lengths of named axes in one file."""
 
 
 def as_array(
@@ -37,8 +38,8 @@ def as_array(
     high: float | int = MAX_MAGNITUDE,
     sizes: Sizes | None = None,
 ) -> np.ndarray:
-    """The value as a float64, int64 or bool array of one of the shapes (of any shape
-    without one), from an array or from nested lists.
+    """Returns the value as a float64, int64 or bool array of one of the shapes (of any
+    shape without one), from an array or from nested lists.
 
     Args:
         kind: `whole` for whole numbers, as int64; `boolean` for true and false, or 0
@@ -96,7 +97,7 @@ def as_number(
     low: float | int = -MAX_MAGNITUDE,
     high: float | int = MAX_MAGNITUDE,
 ) -> float:
-    """One finite number.
+    """Returns one finite number.
 
     **Raises:** `InputError`, one line, if the value is anything else or out of range.
     """
@@ -120,7 +121,7 @@ def as_whole(
     low: int = 0,
     high: int = 10**12,
 ) -> int:
-    """One whole number, also if it is written as 640.0.
+    """Returns one whole number, also if it is written as 640.0.
 
     **Raises:** `InputError`, one line, if the value is anything else or out of range.
     """
@@ -131,7 +132,7 @@ def as_whole(
 
 
 class Fields:
-    """A dictionary of a file, whose entries are read by what is expected of them."""
+    """A dictionary of a file, whose entries are checked as they are read."""
 
     def __init__(self, path: Path, data: dict, place: str = "") -> None:
         self.path, self.data, self.place = path, data, place
@@ -143,7 +144,7 @@ class Fields:
         return [str(name) for name in self.data]
 
     def value(self, *names: str) -> Any:
-        """The entry under the first of the names that is there.
+        """Returns the entry under the first of the names that is there.
 
         **Raises:** `InputError` if none is.
         """
@@ -162,15 +163,15 @@ class Fields:
         low: float | int = -MAX_MAGNITUDE,
         high: float | int = MAX_MAGNITUDE,
     ) -> float:
-        """A finite number within the range."""
+        """Returns a finite number within the range."""
         return as_number(self.path, self._at(name), self.value(name), low, high)
 
     def whole(self, name: str, low: int = 0, high: int = 10**12) -> int:
-        """A whole number within the range."""
+        """Returns a whole number within the range."""
         return as_whole(self.path, self._at(name), self.value(name), low, high)
 
     def text(self, name: str, among: Collection[str] = ()) -> str:
-        """A text, one of `among` if that is given."""
+        """Returns a text, one of `among` if that is given."""
         found = self.value(name)
         if not isinstance(found, str) or (among and found not in among):
             expected = " or ".join(among) or "a text"
@@ -181,17 +182,17 @@ class Fields:
         return found
 
     def array(self, name: str, *shapes: Shape, **declared: Any) -> np.ndarray:
-        """An array, as `as_array` has it."""
+        """Returns an array as `as_array` does."""
         return as_array(
             self.path, self._at(name), self.value(name), *shapes, **declared
         )
 
     def fields(self, name: str) -> "Fields":
-        """A dictionary within this one."""
+        """Returns a dictionary within this one."""
         return fields(self.path, self.value(name), self._at(name))
 
     def each(self, name: str) -> Iterator["Fields"]:
-        """The dictionaries of a list within this one."""
+        """Yields the dictionaries of a list within this one."""
         found = self.value(name)
         if not isinstance(found, list):
             raise InputError(
@@ -205,7 +206,7 @@ class Fields:
 
 
 def fields(path: Path, data: Any, place: str = "") -> Fields:
-    """The entries of a dictionary.
+    """Returns the checked entries of a dictionary.
 
     **Raises:** `InputError`, one line, if the value is no dictionary.
     """
@@ -218,7 +219,7 @@ def fields(path: Path, data: Any, place: str = "") -> Fields:
 
 
 def shown(value: Any) -> str:
-    """A value of a file in a few words, for messages in one line."""
+    """Returns a value of a file in a few words, for messages in one line."""
     if isinstance(value, list | tuple):
         if len(value) <= 4 and all(isinstance(x, int | float) for x in value):
             return f"{[float(f'{x:.6g}') for x in value]}"
@@ -233,7 +234,8 @@ def shown(value: Any) -> str:
 
 
 def _plain_array(path: Path, name: str, value: Any) -> np.ndarray:
-    """An array of numbers or of true and false; nothing is converted from text."""
+    """Returns an array of numbers or of true and false; nothing is converted from
+    text."""
     if not isinstance(value, np.ndarray):
         _check_entries(path, name, value)
         try:

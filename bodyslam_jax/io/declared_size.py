@@ -11,16 +11,18 @@ from bodyslam_jax.io.frame_index import InvalidContent, Warn
 Size = tuple[float, float]
 """Width and height, px."""
 
-_SAME_ASPECT = 0.015
-"""Relative difference of two aspect ratios that rounding to even sizes may leave."""
-_MAX_SIDE = 1e6
-"""px; a larger number is not the side of an image."""
-_BEYOND = 0.1
-"""Share of the points outside the declared size from which that size is not theirs."""
+_ASPECT_TOLERANCE = 0.015
+"""Largest relative difference of two aspect ratios that rounding to even sizes may
+cause."""
+_MAX_SIDE_PX = 1e6
+"""Largest side of an image, px."""
+_MIN_OUTSIDE_SHARE = 0.1
+"""Least share of the points outside the declared size with which the points do not
+belong to that size."""
 
 
 def size_in(path: Path, data: Any) -> Size | None:
-    """The size that the header of a file of keypoints names, or None.
+    """Returns the size that the header of a file of keypoints names, or None.
 
     COCO has it with each image; others as `width` and `height`, or as two numbers under
     one name: `image_size` and `resolution` with the width first, `img_shape` and
@@ -71,7 +73,7 @@ def _size(width: Any, height: Any) -> Size | None:
         size = float(width), float(height)
     except (TypeError, ValueError, OverflowError):
         return None
-    return size if all(2 <= n <= _MAX_SIDE for n in size) else None
+    return size if all(2 <= n <= _MAX_SIDE_PX for n in size) else None
 
 
 def factor_to(
@@ -81,8 +83,8 @@ def factor_to(
     what: str,
     warn: Warn,
 ) -> float:
-    """The factor, for `scaled`, from pixels of images of size `declared` to pixels of
-    the video of `size` (width, height).
+    """Returns the factor, for `scaled`, from pixels of images of size `declared` to
+    pixels of the video of `size` (width, height).
 
     Args:
         points: some of the points (n, 2; px), to check that they fit images of the
@@ -96,13 +98,13 @@ def factor_to(
         return 1.0
     names = f"images of {w:g}x{h:g} px, but the video has {width}x{height} px"
     aspect = (w / h) / (width / height)
-    if abs(np.log(aspect)) > _SAME_ASPECT:
-        turned = abs(np.log((h / w) / (width / height))) < _SAME_ASPECT
+    if abs(np.log(aspect)) > _ASPECT_TOLERANCE:
+        turned = abs(np.log((h / w) / (width / height))) < _ASPECT_TOLERANCE
         why = "of the video before it was turned upright" if turned else "cropped"
         raise InvalidContent(f"{what} of {names}: {why}, or of another video?")
     factor = float(np.sqrt(width / w * height / h))
     outside = (points > np.asarray(declared)).any(axis=-1)
-    if factor > 1 and len(points) and outside.mean() > _BEYOND:
+    if factor > 1 and len(points) and outside.mean() > _MIN_OUTSIDE_SHARE:
         warn(
             f"{what} of {names}, though {100 * outside.mean():.0f} % of them are "
             "beyond that size: taken as pixels of the video."
@@ -113,6 +115,6 @@ def factor_to(
 
 
 def scaled(uv: np.ndarray, factor: float) -> np.ndarray:
-    """Pixels in images resized by `factor`, which keeps the images' corners, not the
-    centres of pixels."""
+    """Returns pixels in images resized by `factor`, which keeps the images' corners,
+    not the centres of pixels."""
     return (uv + 0.5) * factor - 0.5

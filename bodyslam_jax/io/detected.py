@@ -20,7 +20,7 @@ def with_detections(
     detected: DetectedPeople | None = None,
     definition: str = "unknown",
 ) -> Sequence:
-    """The sequence with people made of what a detector found in each of its frames.
+    """Returns the sequence with people made of the detections in each of its frames.
 
     If bodies are given, only the people with a body are estimated. Everybody else who
     was detected is only kept out of the map.
@@ -55,7 +55,7 @@ def with_detections(
 
 
 def detected_people(detections: Detections) -> DetectedPeople:
-    """The detections of all frames in one table."""
+    """Returns the detections of all frames in one table."""
     counts = [len(found) for found in detections]
     keypoints = np.concatenate([np.zeros((0, 25, 3)), *detections])
     return DetectedPeople(np.repeat(np.arange(len(counts)), counts), keypoints)
@@ -66,7 +66,7 @@ def _warned(sequence: Sequence, warnings: tuple[str, ...]) -> Sequence:
 
 
 def _with_body(people: Keypoints, bodies: Bodies) -> tuple[Keypoints, Bodies, int]:
-    """The people who have a body in any frame, and how many have none."""
+    """Returns the people who have a body in any frame, and how many have none."""
     kept = bodies.present.any(axis=1)
     if not kept.any():
         return people, bodies, 0

@@ -2,7 +2,7 @@
 
 
 def error_line(error: BaseException) -> str:
-    """What went wrong, in one line: the file and the system's reason, the message of an
+    """Returns an error in one line: the file and the system's reason, the message of an
     error of the input, or else the kind of the error and the start of its message."""
     if isinstance(error, OSError) and error.strerror:
         return _printable(f"{error.filename or 'file'}: {error.strerror}.")
@@ -13,6 +13,7 @@ def error_line(error: BaseException) -> str:
 
 
 def _printable(text: str) -> str:
-    """The text in one line, without what no terminal or file takes."""
+    """Returns the text in one line, without characters that terminals or files
+    refuse."""
     line = " ".join(text.encode("utf-8", "backslashreplace").decode().split())
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)

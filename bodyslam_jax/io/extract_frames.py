@@ -10,12 +10,12 @@ from jaxtyping import Float, Int
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.video import frames, list_images, look_at, picked
 
-_QUALITY = 95
-"""Of JPEG files."""
+_JPEG_QUALITY = 95
+"""Quality of JPEG files, 0 to 100."""
 
 
 def frame_name(frame: int, suffix: str = ".jpg") -> str:
-    """The name of a frame's image, counted from 0."""
+    """Returns the name of a frame's image, counted from 0."""
     return f"frame_{frame:06d}{suffix}"
 
 
@@ -58,6 +58,6 @@ def extract_frames(
     names = [frame_name(int(k)) for k in chosen]
     images = picked(frames(video), at)
     for name, image in zip(names, images, strict=True):
-        _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         (folder / name).write_bytes(data.tobytes())
     return names

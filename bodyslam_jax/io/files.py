@@ -25,12 +25,13 @@ from bodyslam_jax.io import budget
 from bodyslam_jax.io.declared import Fields, fields
 
 _MAX_DIGITS = 19
-"""Digits of a whole number that is kept as such; a longer one becomes a float."""
+"""Largest number of digits of a whole number that is kept as such; a longer one becomes
+a float."""
 
 
 @contextlib.contextmanager
 def reading(path: Path, expected: str) -> Iterator[None]:
-    """A block in which a library reads the file: every error of it is the file's.
+    """Attributes every error of a library in the block to the file that it reads.
 
     **Raises:** `InputError`, one line: the file, what was found, and `expected`.
     """
@@ -47,7 +48,8 @@ def reading(path: Path, expected: str) -> Iterator[None]:
 
 
 def open_binary(path: Path, what: str = "") -> io.BufferedReader:
-    """The file, opened, after it was seen to be a plain file within the budget.
+    """Returns the opened file, after checking that it is a plain file within the
+    budget.
 
     **Raises:** `InputError`, naming the file, if it is missing, cannot be read, is a
     folder, a pipe or a device, or exceeds the budget.
@@ -71,7 +73,7 @@ def open_binary(path: Path, what: str = "") -> io.BufferedReader:
 
 
 def is_zip(path: Path) -> bool:
-    """Whether a file begins as zip archives do.
+    """Returns True if a file begins as zip archives do.
 
     **Raises:** `InputError` as `open_binary`.
     """
@@ -80,7 +82,7 @@ def is_zip(path: Path) -> bool:
 
 
 def read_bytes(path: Path, what: str = "") -> bytes:
-    """The whole content of a file.
+    """Returns the whole content of a file.
 
     Args:
         what: was expected, for messages.
@@ -95,8 +97,8 @@ def read_bytes(path: Path, what: str = "") -> bytes:
 
 
 def read_text(path: Path, what: str = "a text file") -> str:
-    """The text of a file in UTF-8, or in UTF-16 if it says so; a mark of the order of
-    bytes, which some editors write, is left out.
+    """Returns the text of a file in UTF-8, or in UTF-16 if it says so; a mark of the
+    order of bytes, which some editors write, is left out.
 
     **Raises:** `InputError` as `open_binary`, or if it is binary.
     """
@@ -116,7 +118,7 @@ def read_text(path: Path, what: str = "a text file") -> str:
 
 
 def read_lines(path: Path, what: str = "a text file") -> list[str]:
-    """The lines of a text file, without their ends.
+    """Returns the lines of a text file, without their ends.
 
     **Raises:** as `read_text`.
     """
@@ -124,7 +126,7 @@ def read_lines(path: Path, what: str = "a text file") -> list[str]:
 
 
 def read_csv(path: Path, what: str = "a table (CSV)") -> list[list[str]]:
-    """The rows of a CSV file that have cells.
+    """Returns the rows of a CSV file that have cells.
 
     **Raises:** as `read_text`, or if its quotes are wrong.
     """
@@ -139,7 +141,7 @@ def read_csv(path: Path, what: str = "a table (CSV)") -> list[list[str]]:
 
 
 def read_json(path: Path, what: str = "a JSON file") -> Any:
-    """The content of a JSON file. Whole numbers beyond 64 bits become floats.
+    """Returns the content of a JSON file. Whole numbers beyond 64 bits become floats.
 
     **Raises:** as `read_text`, or if it is not JSON, is nested too deeply, has too many
     values, or a name twice in one object.
@@ -148,7 +150,8 @@ def read_json(path: Path, what: str = "a JSON file") -> Any:
 
 
 def parse_json(text: str, path: Path, what: str = "a JSON file") -> Any:
-    """`read_json` of a text that is within the file at `path`."""
+    """Returns the content of a JSON text that is within the file at `path`, as
+    `read_json`."""
     number = 1 + text.count(",") + text.count("[") + text.count("{")
     if number > budget.MAX_ELEMENTS:
         raise InputError(
@@ -177,7 +180,7 @@ def parse_json(text: str, path: Path, what: str = "a JSON file") -> Any:
 
 
 def read_json_fields(path: Path, what: str = "a JSON file") -> Fields:
-    """The entries of a JSON object, to be read by what is expected of each.
+    """Returns the entries of a JSON object, which are checked as they are read.
 
     **Raises:** as `read_json`, or if it is no object.
     """
@@ -185,7 +188,7 @@ def read_json_fields(path: Path, what: str = "a JSON file") -> Fields:
 
 
 def read_yaml(path: Path, what: str = "a YAML file") -> Any:
-    """The content of a YAML file; a date stays the text that it is.
+    """Returns the content of a YAML file; a date stays the text that it is.
 
     OpenCV's files are read, too: `%YAML:1.0`, and `!!opencv-matrix` as a dictionary.
 
@@ -230,7 +233,7 @@ def read_yaml(path: Path, what: str = "a YAML file") -> Any:
 
 
 def read_toml(path: Path, what: str = "a TOML file") -> dict[str, Any]:
-    """The content of a TOML file.
+    """Returns the content of a TOML file.
 
     **Raises:** as `read_text`, or if it is not TOML or too large.
     """
@@ -240,7 +243,7 @@ def read_toml(path: Path, what: str = "a TOML file") -> dict[str, Any]:
 
 
 def read_xml(path: Path, what: str = "an XML file") -> ElementTree.Element:
-    """The root of an XML file that declares no entities, which could expand.
+    """Returns the root of an XML file that declares no entities, which could expand.
 
     **Raises:** as `read_text`, or if it is not XML, declares a document type or
     entities, or is too large.
@@ -295,7 +298,7 @@ class Members:
         return list(self._info)
 
     def read(self, name: str) -> bytes:
-        """One file.
+        """Returns one file.
 
         **Raises:** `InputError`, naming both, if it is not there or damaged.
         """
@@ -304,7 +307,7 @@ class Members:
 
     @contextlib.contextmanager
     def opened(self, name: str) -> Iterator[Any]:
-        """One file, as a stream of what it unpacks to."""
+        """Returns one file, as a stream of what it unpacks to."""
         if name not in self._info:
             found = ", ".join(other[:40] for other in self.names[:12]) or "nothing"
             raise InputError(f"{self.path}: no {name} in it; found {found}.")
@@ -314,7 +317,7 @@ class Members:
                     yield file
 
     def size(self, name: str) -> int:
-        """Bytes that a file unpacks to, as the archive declares it."""
+        """Returns the bytes that a file unpacks to, as the archive declares it."""
         return self._info[name].file_size
 
     @contextlib.contextmanager
@@ -326,7 +329,7 @@ class Members:
 
 
 def read_zip(path: Path, what: str = "a zip archive") -> Members:
-    """The files within a zip archive.
+    """Returns the files within a zip archive.
 
     **Raises:** `InputError` as `open_binary`, or if it is no zip archive, is damaged,
     or unpacks to more than the budget.
@@ -346,7 +349,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _repeated(names: list[str]) -> str:
-    """The first name that occurs twice."""
+    """Returns the first name that occurs twice."""
     seen: set[str] = set()
     return next(n for n in names if n in seen or seen.add(n))[:60]
 
@@ -356,7 +359,7 @@ def _whole(digits: str) -> int | float:
 
 
 def _depth(data: Any) -> int:
-    """Levels of nesting, counted up to one more than are allowed."""
+    """Returns the levels of nesting, counted up to one more than are allowed."""
     level, depth = [data], 0
     while level and depth <= budget.MAX_DEPTH:
         level = [one for one in level if type(one) in (list, dict)]
@@ -374,7 +377,7 @@ def _mapping(loader: Any, node: Any) -> Any:
 
 
 def _plain_yaml() -> Any:
-    """A loader of text, numbers, lists and mappings."""
+    """Returns a loader of text, numbers, lists and mappings."""
     import yaml
 
     class Loader(yaml.SafeLoader):

@@ -1,4 +1,5 @@
-"""What a reader of one tool's files is, and how the reader of a given file is found.
+"""The registry of readers: what a format of one tool is, and how the format of a given
+file is found.
 
 A format is one class in one file: `recognises` tells its files from others, `read`
 reads them, `layout` names what they hold. Keypoint formats
@@ -32,7 +33,7 @@ class Source:
 
     path: Path
     content: Any = None
-    """The content, parsed; `None` for a folder, and for a file whose suffix only some
+    """The parsed content; `None` for a folder, and for a file whose suffix only some
     formats know (`Format.suffixes`): those open it themselves, by `io.files`."""
 
 
@@ -40,26 +41,27 @@ class Format(abc.ABC):
     """A tool's files: how they are recognised and what is in them."""
 
     name: ClassVar[str]
-    """As messages call it."""
+    """Name in messages."""
     layout: ClassVar[tuple[str, ...] | None] = None
-    """What the files hold, by name; subclasses say of what."""
+    """Names of the contents of the files; subclasses define of which."""
     folder: ClassVar[str] = ""
     """Pattern of the names of the files, if the format is a folder of them."""
     suffixes: ClassVar[tuple[str, ...]] = ()
-    """Suffixes (lower case, with the dot) of files that are of no general kind, so that
-    only this format can open them."""
+    """Suffixes (lower case, with the dot) of files that only this format can open."""
 
     @abc.abstractmethod
     def recognises(self, source: Source) -> bool:
-        """Whether the file or folder is of this format; decided by its content."""
+        """Returns True if the file or folder is of this format; decided by its
+        content."""
 
 
 F = TypeVar("F", bound=Format)
 
 
 def formats(kind: type[F], package: str, group: str) -> list[F]:
-    """All formats of a kind: those in the modules of `package`, in the order of the
-    modules' names, then those that installed packages name as entry points of `group`.
+    """Returns all formats of a kind: those in the modules of `package`, in the order of
+    the modules' names, then those that installed packages name as entry points of
+    `group`.
 
     An entry point that cannot be loaded, or is no such format, is left out with a
     warning: it must not keep others from being read.
@@ -93,8 +95,8 @@ def formats(kind: type[F], package: str, group: str) -> list[F]:
 def format_of(
     path: Path, among: Sequence[F], parse: Callable[[Path], Any]
 ) -> tuple[F | None, Source]:
-    """The first format that recognises the file or folder, or `None`; and the file with
-    its content as `parse` gives it.
+    """Returns the first format that recognises the file or folder, or `None`; and the
+    file with its content as `parse` gives it.
 
     **Raises:** `InputError` of `parse`, or if no format that is a folder recognises a
     folder.
@@ -125,14 +127,14 @@ def _recognised(one: Format, source: Source) -> bool:
 
 
 def names_of(among: Sequence[Format]) -> str:
-    """The names of the formats, for messages: `A, B or C`."""
+    """Returns the names of the formats, for messages: `A, B or C`."""
     *most, last = dict.fromkeys(f.name for f in among)
     return f"{', '.join(most)} or {last}" if most else last
 
 
 @contextlib.contextmanager
 def attributed(path: Path, what: str) -> Iterator[None]:
-    """A block in which a format's reader runs: every error of it is the file's.
+    """Attributes every error of a format's reader in the block to its file.
 
     **Raises:** `InputError`, one line that names the file.
     """

@@ -12,7 +12,7 @@ from bodyslam_jax.io.budget import last_frame_problem
 from bodyslam_jax.io.video import IMAGE_SUFFIXES
 
 Warn = Callable[[str], None]
-"""Called with what was guessed or left out: one line, for the report."""
+"""Function that is called with a line for the report: what was guessed or left out."""
 
 _SUFFIX = re.compile(
     r"(_keypoints)?\.json$|(" + "|".join(map(re.escape, IMAGE_SUFFIXES)) + r")$", re.I
@@ -20,7 +20,7 @@ _SUFFIX = re.compile(
 
 
 _MAX_DIGITS = 255
-"""Digits of a number in a name: file systems allow no longer names."""
+"""Largest number of digits in a name: file systems allow no longer names."""
 
 
 class InvalidContent(ValueError):
@@ -36,7 +36,7 @@ def frames_of_names(
     complete: bool,
     warn: Warn,
 ) -> dict[str, int]:
-    """The index of the video's frame for each image name in a file.
+    """Returns the index of the video's frame for each image name in a file.
 
     Args:
         names: names of all images that the file lists, with or without people.
@@ -70,7 +70,7 @@ def frames_of_names(
 
 
 def gap_among(images: Sequence[str]) -> str | None:
-    """A warning if the numbers in the names of a video's images have gaps.
+    """Returns a warning if the numbers in the names of a video's images have gaps.
 
     With gaps at more than one image in ten, images were thinned on purpose: no warning.
     """
@@ -91,12 +91,12 @@ def gap_among(images: Sequence[str]) -> str | None:
 
 
 def _stem(name: str) -> str:
-    """The name without folders and known suffixes; other dots belong to it."""
+    """Returns the name without folders and known suffixes; other dots belong to it."""
     return _SUFFIX.sub("", re.split(r"[/\\]", name)[-1])
 
 
 def _numbers(stems: list[str]) -> list[int] | None:
-    """The last number in each name that differs between all names.
+    """Returns for each name the last of its numbers that differs between the names.
 
     For example 12 for `000012_cam1`, if another name is `000013_cam1`. None if a name
     has no number.
@@ -131,7 +131,8 @@ def _refuse_two_of_one(names: list[str], numbers: list[int]) -> None:
 def _by_image(
     numbers: list[int], images: list[str], what: str, warn: Warn
 ) -> list[int] | None:
-    """Frames by the numbers of the images themselves; None if those are others."""
+    """Returns frames by the numbers of the images themselves; `None` if those are
+    others."""
     of_images = (_numbers(images) if images else None) or []
     place = {n: k for k, n in enumerate(of_images)}
     if len(place) < len(of_images) or not all(n in place for n in numbers):
@@ -148,7 +149,7 @@ def _by_image(
 def _first(
     numbers: list[int], num_frames: int | None, what: str, complete: bool, warn: Warn
 ) -> int:
-    """The number of frame 0."""
+    """Returns the number of frame 0."""
     first, last = min(numbers), max(numbers)
     unbroken = len(set(numbers)) == last - first + 1
     if num_frames is None:

@@ -19,7 +19,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def read_image(path: Path, flag: int = cv2.IMREAD_COLOR) -> np.ndarray:
-    """The pixels of an image, BGR or as OpenCV's `flag` says.
+    """Returns the pixels of an image, BGR or as OpenCV's `flag` says.
 
     **Raises:** `InputError`, naming the file, if it is no image, is damaged, or has
     more pixels by its header than the budget allows; those are never decoded.
@@ -37,7 +37,8 @@ def read_image(path: Path, flag: int = cv2.IMREAD_COLOR) -> np.ndarray:
 
 
 def exif_focal_35mm(path: Path) -> float | None:
-    """The focal length in a photo's EXIF data, mm for film of 35 mm, or `None`."""
+    """Returns the focal length in a photo's EXIF data, mm for film of 35 mm, or
+    `None`."""
     try:
         with open_binary(path, "an image") as file, reading(path, "an image"):
             with _header(file) as opened:
@@ -69,8 +70,8 @@ def _check_header(path: Path, data: bytes) -> None:
 
 
 def _is_whole_png(data: bytes) -> bool:
-    """Whether the chunks of a PNG lie within it: OpenCV would allocate what one claims
-    to have, up to 2 GB."""
+    """Returns True if the chunks of a PNG lie within it: OpenCV would allocate what one
+    claims to have, up to 2 GB."""
     at = len(_PNG)
     while at + 8 <= len(data):
         at += 12 + int.from_bytes(data[at : at + 4], "big")
@@ -80,7 +81,7 @@ def _is_whole_png(data: bytes) -> bool:
 
 
 def _header(file: Any) -> Any:
-    """The image, of which Pillow has read no more than the header."""
+    """Returns the image, of which Pillow has read no more than the header."""
     from PIL import Image
 
     Image.init()

@@ -1,4 +1,4 @@
-"""Text that tables and pages take in: one escaping function for each language.
+"""Escapes text for tables and pages: one function for each language.
 
 Names of clips, reasons and statuses may come from folders that somebody else made. A
 spreadsheet evaluates cells that begin like a formula, Markdown renders links and HTML,
@@ -17,7 +17,7 @@ _FORMULA = re.compile(
 """Beginnings that spreadsheets take for a formula, also in full width, or that hide
 one (OWASP, "CSV Injection")."""
 _QUOTED = re.compile(r"[,;\"\t\r\n|]|^\s|\s$")
-"""What must be inside quotes, whichever sign separates cells where a table is read."""
+"""Pattern of what must be inside quotes, for any separator of cells."""
 _CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
 _MARKDOWN = re.compile(r"[\\`|<>\[\]]|&(?=#?\w+;)")
 _AUTOLINK = re.compile(r"(https?|ftp)(?=://)|\bwww(?=\.)", re.IGNORECASE)
@@ -31,7 +31,8 @@ _LATEX = {
 
 
 def csv_table(rows: Iterable[Sequence[Any]]) -> str:
-    """Rows as CSV; text that a spreadsheet would evaluate has an apostrophe in front.
+    """Returns rows as CSV; text that a spreadsheet would evaluate has an apostrophe in
+    front.
 
     Numbers, also as text, are as they are; `None` is an empty cell.
     """
@@ -39,7 +40,7 @@ def csv_table(rows: Iterable[Sequence[Any]]) -> str:
 
 
 def csv_cell(value: Any) -> str:
-    """A cell of CSV."""
+    """Returns a cell of CSV."""
     if value is None:
         return ""
     text = str(value)
@@ -56,7 +57,7 @@ def markdown_table(
     right: Sequence[bool] = (),
     last: Sequence[str] = (),
 ) -> str:
-    """A Markdown table of text cells, the first row its titles.
+    """Returns a Markdown table of text cells, the first row its titles.
 
     Args:
         right: of each column, whether it is aligned to the right.
@@ -72,7 +73,8 @@ def markdown_table(
 
 
 def markdown_text(text: str) -> str:
-    """Text that Markdown shows as it is, in one line: no HTML, code, links or cells."""
+    """Returns text that Markdown shows as it is, in one line: no HTML, code, links or
+    cells."""
     plain = _CONTROLS.sub(" ", text)
     escaped = _MARKDOWN.sub(lambda found: _MARKDOWN_SIGNS[found[0]], plain)
     # An entity in place of a letter, which links without brackets do not begin with.
@@ -84,13 +86,13 @@ _MARKDOWN_SIGNS |= {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 
 def latex_text(text: str) -> str:
-    """Text that LaTeX shows as it is."""
+    """Returns text that LaTeX shows as it is."""
     plain = _CONTROLS.sub(" ", text)
     return "".join(_LATEX.get(letter, letter) for letter in plain)
 
 
 def json_in_html(value: Any) -> str:
-    """JSON for an element `script` of a page: it has no `<`, `>` or `&`, and no
+    """Returns JSON for an element `script` of a page: it has no `<`, `>` or `&`, and no
     character outside ASCII."""
     text = json.dumps(value, separators=(",", ":"))
     for sign in "<>&":

@@ -20,25 +20,27 @@ from bodyslam_jax.io.video import list_images
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, MaskUse
 
 _NUM_CHECKED = 12
-"""Masks that are checked when the input is read."""
-_SURE = 0.3
-"""Confidence of a keypoint that is compared with the masks."""
+"""Number of masks that are checked when the input is read."""
+_MIN_CONFIDENCE = 0.3
+"""Least confidence of a keypoint that is compared with the masks."""
 _MIN_POINTS = 20
-"""Points of a person, in all checked frames, for a comparison."""
-_MAX_AREA = 0.5
+"""Least number of points of a person, in all checked frames, for a comparison."""
+_MAX_AREA_SHARE = 0.5
 """Share of the image that people seldom fill."""
-_MAX_BORDER = 0.75
+_MAX_BORDER_SHARE = 0.75
 """Share of the image's border that people never fill."""
-_MIN_COVERED = 0.35
-"""Share of a person's points within the masks; with less, masks are not theirs."""
-_NOTHING_LEFT = 0.9
-"""Share of the image from which too little is left for tracking."""
+_MIN_COVERED_SHARE = 0.35
+"""Least share of a person's points within masks that are of this video."""
+_MAX_MASKED_SHARE = 0.9
+"""Masked share of the image from which too little remains for tracking."""
 _MARGIN = 0.02
-"""Distance of a keypoint from a mask that still counts as within, as a share of the
+"""Largest distance of a keypoint from a mask that counts as within, relative to the
 image's longer side."""
 _ASPECT_TOLERANCE = 0.015
-"""Difference of the logarithms of two aspect ratios that counts as none."""
-_ABOUT_PELVIS = np.array([[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.5, -0.2, 0.3)])
+"""Largest difference of the logarithms of two equal aspect ratios."""
+_PELVIS_POINTS_M = np.array(
+    [[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.5, -0.2, 0.3)]
+)
 """Points relative to the pelvis, m, that lie on most bodies in any posture."""
 
 
@@ -52,7 +54,8 @@ def read_masks(
     bodies: Bodies | None = None,
     warn: Warn,
 ) -> MaskUse:
-    """How the masks in a folder or in one `.npz` are to be used, after checking some.
+    """Checks some of the masks in a folder or in one `.npz` and returns how they are to
+    be used.
 
     Masks in which zero marks people are inverted, and masks of another size but the
     same aspect ratio are resized, both with a warning. If masks do not cover the
@@ -82,7 +85,8 @@ def read_masks(
 
 
 def mask_names(source: Path) -> list[str]:
-    """Names of the images in a folder, or the numbers of the masks in an `.npz`.
+    """Returns names of the images in a folder, or the numbers of the masks in an
+    `.npz`.
 
     **Raises:** `InputError`, naming the file, if it is neither.
     """
@@ -94,7 +98,7 @@ def mask_names(source: Path) -> list[str]:
 
 
 def read_named(source: Path, name: str) -> Bool[np.ndarray, "y x"]:
-    """One of the masks that `mask_names` lists.
+    """Returns one of the masks that `mask_names` lists.
 
     **Raises:** `InputError`, naming the file, if it is no image.
     """
@@ -103,8 +107,8 @@ def read_named(source: Path, name: str) -> Bool[np.ndarray, "y x"]:
 
 @functools.lru_cache(maxsize=1)
 def _stack(path: Path) -> Bool[np.ndarray, "t y x"]:
-    """The masks of an `.npz`: `masks` (t, y, x), or the only array in it; several
-    people's masks (t, h, y, x) become one.
+    """Returns the masks of an `.npz`: `masks` (t, y, x), or the only array in it;
+    several people's masks (t, h, y, x) become one.
 
     **Raises:** `InputError`, naming the file, if there is no such array.
     """
@@ -126,8 +130,8 @@ def _stack(path: Path) -> Bool[np.ndarray, "t y x"]:
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "y x"]:
-    """Where a mask is not zero; in a lossy format, where it is bright. An image of one
-    colour with a varying alpha channel is read by that channel.
+    """Returns where a mask is not zero; in a lossy format, where it is bright. An image
+    of one colour with a varying alpha channel is read by that channel.
 
     **Raises:** `InputError`, naming the file, if it is no image.
     """
@@ -144,7 +148,7 @@ def read_mask(path: Path) -> Bool[np.ndarray, "y x"]:
 def resized_to(
     path: Path, mask: Bool[np.ndarray, "y x"], size: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
-    """The mask resized to `size` (width, height; px).
+    """Returns the mask resized to `size` (width, height; px).
 
     **Raises:** `InputError`, naming the file, if its aspect ratio is another.
     """
@@ -160,8 +164,8 @@ def resized_to(
 def _by_frame(
     folder: Path, names: list[str], num_frames: int, images: tuple[str, ...], warn: Warn
 ) -> tuple[list[tuple[str, ...]], set[int]]:
-    """Names of the masks of each frame, and the frames without a mask of their own,
-    which use the nearest ones before and after."""
+    """Returns names of the masks of each frame, and the frames without a mask of their
+    own, which use the nearest ones before and after."""
     if len(names) == num_frames:
         return [(name,) for name in names], set()
     count = f"{len(names)} masks, but the video has {num_frames} frames"
@@ -202,14 +206,15 @@ def _by_frame(
 def _points(
     people: Keypoints | None, bodies: Bodies | None, intrinsics: Intrinsics
 ) -> Float[np.ndarray, "h t n 3"] | None:
-    """Image points of each person in each frame: u px, v px, 1 or 0 if missing."""
+    """Returns image points of each person in each frame: u px, v px, 1 or 0 if
+    missing."""
     if people is not None:
-        sure = people.confidence > _SURE
+        sure = people.confidence > _MIN_CONFIDENCE
         present = sure if sure.any() else people.confidence > 0
         return np.concatenate([people.uv, present[..., None].astype(float)], axis=-1)
     if bodies is None:
         return None
-    place = bodies.trans[:, :, None] + _ABOUT_PELVIS
+    place = bodies.trans[:, :, None] + _PELVIS_POINTS_M
     uv = project_points(intrinsics, place.reshape(-1, 3)).reshape(*place.shape[:3], 2)
     present = np.broadcast_to(bodies.present[..., None], uv.shape[:3])
     return np.concatenate([uv, present[..., None].astype(float)], axis=-1)
@@ -218,24 +223,29 @@ def _points(
 def _judged(
     masks: dict[int, np.ndarray], points: np.ndarray | None, warn: Warn
 ) -> tuple[bool, bool]:
-    """Whether masks are inverted, and whether they cover the people, then."""
+    """Returns whether masks are inverted, and whether they cover the people after that
+    is corrected."""
     area = float(np.median([mask.mean() for mask in masks.values()]))
     border = float(np.median([_on_border(mask) for mask in masks.values()]))
     within = _within(masks, points)
     least = within.min(initial=1.0)
-    inverted = bool(border > _MAX_BORDER and area > _MAX_AREA and least < _MIN_COVERED)
+    inverted = bool(
+        border > _MAX_BORDER_SHARE
+        and area > _MAX_AREA_SHARE
+        and least < _MIN_COVERED_SHARE
+    )
     if not len(within):
-        inverted = border > _MAX_BORDER and _MAX_AREA < area < 1
+        inverted = border > _MAX_BORDER_SHARE and _MAX_AREA_SHARE < area < 1
     if inverted:
         what = "they touch nearly all of its border"
         if len(within):
             what = f"no more than {100 * least:.0f} % of a person's points"
         warn(f"masks: {100 * area:.0f} % of the image, and {what}: taken as inverted.")
         within, area = 1 - within, 1 - area
-    if area > _NOTHING_LEFT:
+    if area > _MAX_MASKED_SHARE:
         warn(f"masks: {100 * area:.0f} % of the image: little is left to follow.")
     most = within.max(initial=0.0)
-    if len(within) and most < _MIN_COVERED:
+    if len(within) and most < _MIN_COVERED_SHARE:
         what = "nothing" if area == 0 else f"{100 * most:.0f} % of people's points"
         warn(
             f"masks: cover {what}: of another video? People's keypoints are masked "
@@ -246,7 +256,7 @@ def _judged(
 
 
 def _within(masks: dict[int, np.ndarray], points: np.ndarray | None) -> np.ndarray:
-    """For each person with enough points, the share of them within the masks."""
+    """Returns for each person with enough points the share of them within the masks."""
     if points is None:
         return np.zeros(0)
     count, hit = np.zeros(len(points)), np.zeros(len(points))
@@ -254,7 +264,7 @@ def _within(masks: dict[int, np.ndarray], points: np.ndarray | None) -> np.ndarr
         near = 2 * max(1, round(_MARGIN * max(mask.shape))) + 1
         wide = cv2.dilate(mask.astype(np.uint8), np.ones((near, near), np.uint8))
         height, width = mask.shape
-        if mask.mean() > _MAX_AREA:
+        if mask.mean() > _MAX_AREA_SHARE:
             wide = mask.astype(np.uint8)
         u, v = np.round(points[:, k, :, 0]), np.round(points[:, k, :, 1])
         inside = (points[:, k, :, 2] > 0) & (u >= 0) & (v >= 0)

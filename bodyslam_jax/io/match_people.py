@@ -1,4 +1,4 @@
-"""Keypoints and bodies of the same person -> the same index."""
+"""Matches keypoints and bodies of the same person to the same index."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from bodyslam_jax.io.camera.calibration import project_points
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints
 
 _MID_HIP = BODY25["mid_hip"]
-_UNMATCHED = 1e6
+_UNMATCHED_COST = 1e6
 """Cost of two people who are never in the same frame."""
 
 
@@ -24,7 +24,7 @@ def pair(
     are kept, with confidence 0 or not present.
     """
     num_k, num_b = len(keypoints.uv), len(bodies.present)
-    cost = np.full((num_k, num_b), _UNMATCHED)
+    cost = np.full((num_k, num_b), _UNMATCHED_COST)
     for j in range(num_b):
         # Of a body of average size: what people have in common does not matter here.
         pelvis = bodies.trans[j] + np.array([0.0, -0.2, 0.0])

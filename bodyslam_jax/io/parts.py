@@ -1,4 +1,4 @@
-"""Which files of a folder are the parts of a sequence; no file is opened."""
+"""Finds the files of a folder that are the parts of a sequence; no file is opened."""
 
 import dataclasses
 from pathlib import Path
@@ -26,7 +26,7 @@ class Parts:
 
 
 def find_parts(path: Path) -> Parts:
-    """The parts of a sequence folder; or a lone video file or folder of images.
+    """Returns the parts of a sequence folder; or a lone video file or folder of images.
 
     **Raises:** `InputError` if `path` does not exist, or holds several videos of which
     none is called `video`.
@@ -49,7 +49,7 @@ def find_parts(path: Path) -> Parts:
 
 
 def _other_footage(folder: Path) -> Path | None:
-    """A video under another name, or the folder itself if images lie in it."""
+    """Returns a video under another name, or the folder itself if images lie in it."""
     videos = sorted(
         file
         for file in folder.iterdir()

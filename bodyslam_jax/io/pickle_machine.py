@@ -39,15 +39,17 @@ from bodyslam_jax.io.plain_arrays import (
 )
 
 MAX_PICKLES = 4
-"""Pickles within pickles, as joblib's arrays of objects are."""
+"""Largest number of nested pickles, such as joblib's arrays of objects."""
 MAX_LINE_BYTES = 65_536
-"""Of a line of protocol 0 that is no text: a name or a number."""
+"""Largest length of a line of protocol 0 that is not text but a name or a number,
+bytes."""
 MAX_COLLISIONS = 100
-"""Keys that are tuples and share a hash: a few by chance, more by intent."""
+"""Largest number of keys that are tuples and share a hash: a few do by chance, more by
+intent."""
 OBJECT_BYTES = 300
-"""What a container costs in memory: an empty set, the largest, takes 240."""
+"""Memory of a container, bytes: an empty set, the largest, takes 240."""
 BLOB_BYTES = 4096
-"""Bytes and Python 2's texts from this length on stay in the file until used."""
+"""Length from which bytes and Python 2's texts stay in the file until used, bytes."""
 
 Persistent = Callable[[Any], Any]
 
@@ -85,7 +87,7 @@ class Machine:
         self.collisions = 0
 
     def load(self) -> Any:
-        """The plain data that the pickle makes.
+        """Returns the plain data that the pickle makes.
 
         **Raises:** `Refused` or `Damaged`; `IndexError` and others of Python's if the
         pickle is damaged.
@@ -110,7 +112,7 @@ class Machine:
     # What instructions are made of
 
     def bytes_at(self, count: int) -> memoryview:
-        """The next bytes, which are not copied."""
+        """Returns the next bytes without copying them."""
         end = self.at + count
         if end > len(self.data):
             raise Damaged(f"{count} bytes, {len(self.data) - self.at} are there")
@@ -134,12 +136,12 @@ class Machine:
         self.stack.append(value)
 
     def pop_mark(self) -> list[Any]:
-        """All objects above the last mark, which goes."""
+        """Removes the last mark and returns all objects above it."""
         items, self.stack = self.stack, self.marked.pop()
         return items
 
     def named(self, module: Any, name: Any) -> Name:
-        """The stand-in for a name.
+        """Returns the stand-in for a name.
 
         **Raises:** `Refused` for every name that result files do not need.
         """
@@ -174,7 +176,7 @@ class Machine:
         self.push(make(self, *arguments), OBJECT_BYTES)
 
     def key(self, value: Any) -> Any:
-        """A value as the key of a dictionary or the element of a set."""
+        """Returns a value as the key of a dictionary or the element of a set."""
         if isinstance(value, Blob):
             value = content_of(value, self.account)
         if type(value) in (str, int, float, bool, bytes, type(None)):
@@ -232,7 +234,7 @@ class Machine:
             raise Refused(f"it wants to change {shown(target)}")
 
     def _array(self, state: Any) -> Any:
-        """What `numpy.ndarray.__setstate__` would make."""
+        """Returns what `numpy.ndarray.__setstate__` would make."""
         if type(state) is not tuple or len(state) not in (4, 5):
             raise Refused("an array without shape, type and content")
         shape, of, by_column, content = state[-4:]
@@ -250,7 +252,7 @@ class Machine:
     def array(
         self, content: Any, of: Any, shape: Any, by_column: bool = False
     ) -> np.ndarray:
-        """An array of bytes that the pickle holds."""
+        """Returns an array of bytes that the pickle holds."""
         if not isinstance(of, ArrayType):
             raise Refused("an array without a type")
         if isinstance(content, Blob):
@@ -284,7 +286,7 @@ class Machine:
 
 
 def _whole(value: int) -> int:
-    """A whole number that fits 64 bits; later code converts it to such."""
+    """Returns a whole number that fits 64 bits; later code converts it to such."""
     if not -(2**63) <= value < 2**64:
         raise Refused("a whole number of more than 64 bits")
     return value
@@ -329,7 +331,7 @@ def _written_float(machine: Machine) -> None:
 
 
 def _written_string(machine: Machine) -> None:
-    """A text of Python 2, in quotes."""
+    """Pushes a text of Python 2, in quotes."""
     text = machine.line(len(machine.data))
     if len(text) < 2 or text[:1] not in b"'\"" or text[:1] != text[-1:]:
         raise Damaged(f"{text[:40]!r} as a text in quotes")
@@ -348,7 +350,8 @@ def _written_unicode(machine: Machine) -> None:
 
 
 def _sized(layout: str, kind: type, is_text: bool = False) -> Callable[[Machine], None]:
-    """Bytes, or a text, behind their length."""
+    """Returns the instruction that pushes bytes, or a text, preceded by their
+    length."""
     width = struct.Struct(layout)
 
     def step(machine: Machine) -> None:
@@ -381,7 +384,7 @@ def _tuple_of(count: int) -> Callable[[Machine], None]:
 
 
 def _of_marked(make: Callable[[Machine, list], Any]) -> Callable[[Machine], None]:
-    """A container of all objects above the mark."""
+    """Returns the instruction that pushes a container of all objects above the mark."""
 
     def step(machine: Machine) -> None:
         items = machine.pop_mark()
@@ -484,7 +487,7 @@ def _new_with_names(machine: Machine) -> None:
 
 
 def _instance(machine: Machine) -> None:
-    """An object of an old class of Python 2, by its name."""
+    """Pushes an object of an old class of Python 2, by its name."""
     of = machine.named(machine.line().decode(), machine.line().decode())
     machine.call(of, tuple(machine.pop_mark()))
 
@@ -512,7 +515,7 @@ def _protocol(machine: Machine) -> None:
 
 
 def _frame(machine: Machine) -> None:
-    """The length of a part, for those who read in parts."""
+    """Checks the length of a frame, which only readers in parts need."""
     length = machine.number(struct.Struct("<Q"))
     if length > len(machine.data) - machine.at:
         raise Damaged(f"{length} bytes, {len(machine.data) - machine.at} are there")

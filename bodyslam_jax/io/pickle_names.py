@@ -1,4 +1,4 @@
-"""What stands for the names in result files: NumPy, joblib, PyTorch, collections.
+"""Replacements of the names in result files: NumPy, joblib, PyTorch, collections.
 
 No function here calls what it stands for. NumPy's arrays, their types and PyTorch's
 tensors are described by the pickle; what it says is checked, and the array is made by
@@ -25,11 +25,13 @@ if TYPE_CHECKING:
     from bodyslam_jax.io.pickle_machine import Machine
 
 MAX_REPEATED_BYTES = 16_000_000
-"""Of a tensor that repeats its numbers: ten β for each of 400,000 frames."""
+"""Largest size of a tensor that repeats its numbers, bytes: ten β for each of 400,000
+frames."""
 
 
 def set_type(of: ArrayType, state: Any) -> None:
-    """What `numpy.dtype.__setstate__` would do: only the order of bytes may change.
+    """Sets a type as `numpy.dtype.__setstate__` would: only the order of bytes may
+    change.
 
     The state is (version, order, subtype, names, fields, item size, alignment, flags).
     """
@@ -57,7 +59,8 @@ def _type(_: "Machine", code: Any = None, *flags: Any) -> ArrayType:
 
 
 def _reconstruct(_: "Machine", kind: Any, shape: Any, code: Any) -> ArrayToFill:
-    """An empty array, whose state follows; shape and type given here are not used."""
+    """Returns an empty array, whose state follows; shape and type given here are not
+    used."""
     if kind != Name("numpy.ndarray"):
         raise Refused(f"an array of class {shown(getattr(kind, 'key', kind))}")
     return ArrayToFill()
@@ -92,7 +95,7 @@ def _joblib(_: "Machine", *arguments: Any) -> JoblibArray:
 
 
 def _encode(machine: "Machine", text: Any, encoding: Any = "latin1") -> bytes:
-    """Bytes, as protocols up to 2 hold them."""
+    """Returns bytes as protocols up to 2 hold them."""
     if type(text) is not str or encoding not in ("latin1", "latin-1"):
         raise Refused(f"{shown(text)} in the encoding {shown(encoding)}")
     machine.account.spend(len(text))
@@ -100,7 +103,7 @@ def _encode(machine: "Machine", text: Any, encoding: Any = "latin1") -> bytes:
 
 
 def _dict(machine: "Machine", *arguments: Any) -> dict:
-    """A dictionary, ordered or not, of pairs."""
+    """Returns a dictionary, ordered or not, of pairs."""
     pairs = arguments[0] if arguments else []
     if len(arguments) > 1 or type(pairs) not in (list, tuple):
         raise Refused(f"a dictionary of {shown(pairs)}")
@@ -113,7 +116,7 @@ def _dict(machine: "Machine", *arguments: Any) -> dict:
 
 
 def _default_dict(machine: "Machine", *arguments: Any) -> dict:
-    """A dictionary; what it makes of missing keys is lost."""
+    """Returns a dictionary, without the default for missing keys."""
     return _dict(machine, *arguments[1:])
 
 
@@ -163,7 +166,7 @@ def _path(machine: "Machine", *parts: Any) -> str:
 
 
 def _reconstructor(machine: "Machine", of: Any, base: Any, state: Any) -> StandIn:
-    """An instance of a new-style class, as Python 2 pickles it."""
+    """Returns an instance of a new-style class, as Python 2 pickles it."""
     if isinstance(of, Name) and of.is_stand_in and base == Name("builtins.object"):
         return StandIn(of.key)
     raise Refused(f"it wants to make {shown(getattr(of, 'key', of))}")
@@ -172,7 +175,7 @@ def _reconstructor(machine: "Machine", of: Any, base: Any, state: Any) -> StandI
 def _tensor(
     machine: "Machine", storage: Any, offset: Any, size: Any, stride: Any, *_: Any
 ) -> np.ndarray:
-    """A copy of a strided view, checked to lie within its storage."""
+    """Returns a copy of a strided view, checked to lie within its storage."""
     if not isinstance(storage, Storage) or type(offset) is not int or offset < 0:
         raise Refused("a tensor without numbers")
     size, stride = plain_arrays.shape_of(size), plain_arrays.shape_of(stride)
@@ -234,7 +237,7 @@ CALLS: dict[str, Callable[..., Any]] = {
     "builtins.complex": _complex,
     "builtins.slice": _slice,
 }
-"""What is done for each name that may be called; every other one is refused."""
+"""Function that replaces each name that may be called; every other name is refused."""
 STORAGES = {
     "torch.DoubleStorage": "f8",
     "torch.FloatStorage": "f4",

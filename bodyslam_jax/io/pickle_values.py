@@ -1,4 +1,4 @@
-"""What a pickle's values are while it runs, and the plain data they become.
+"""Values of a pickle while it runs, and the plain data that they become.
 
 Stand-ins hold a place for objects of libraries; `Plain` replaces them at the end, and
 refuses data that a reader could not walk through.
@@ -12,7 +12,7 @@ import numpy as np
 from bodyslam_jax.io.plain_arrays import VALUE_BYTES, Account, ArrayType, Refused
 
 MAX_DEPTH = 64
-"""Levels of nesting; results of tools have 10 at most."""
+"""Largest number of levels of nesting; results of tools have 10 at most."""
 
 
 class StandIn:
@@ -82,8 +82,11 @@ class Plain:
         self.open: set[int] = set()
 
     def of(self, value: Any) -> Any:
-        """**Raises:** `Refused` if the data contain themselves, are nested too deeply,
-        are too large or hold what is not plain."""
+        """Returns the data without stand-ins.
+
+        **Raises:** `Refused` if the data contain themselves, are nested too deeply, are
+        too large or are not plain.
+        """
         return self._visit(value, 0)[0]
 
     def _visit(self, value: Any, depth: int) -> tuple[Any, int, int]:

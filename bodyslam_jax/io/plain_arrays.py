@@ -13,20 +13,21 @@ from typing import Any
 import numpy as np
 
 MAX_BYTES = 1_000_000_000
-"""Of a file after it is unpacked, and of each part of it."""
-MAX_UNPACKED_FREELY = 100_000_000
-"""Bytes that even the smallest compressed file may unpack to."""
+"""Largest size of an unpacked file, and of each part of it, bytes."""
+MAX_UNPACKED_BYTES = 100_000_000
+"""Size to which even the smallest compressed file may unpack, bytes."""
 MAX_RATIO = 100
 """Ratio of larger content to the file: measurements are compressed to a half or a
 fifth; 1,000, which zlib reaches for zeros, only makes a small file large."""
 MAX_AXES = 32
-"""Of an array, as in every version of NumPy."""
+"""Largest number of axes of an array, as in every version of NumPy."""
 MAX_TEXT_WIDTH = 65_536
-"""Characters of one text in an array of texts, whose texts are all as wide."""
+"""Largest number of characters of a text in an array of texts, which are all as
+wide."""
 MAX_HEADER_BYTES = 65_536
-"""Of an array in NumPy's format: that of a plain type has 128."""
+"""Largest header of an array in NumPy's format, bytes: that of a plain type has 128."""
 VALUE_BYTES = 50
-"""What a number or a reference costs in memory, with its share of a list."""
+"""Memory of a number or a reference, with its share of a list, bytes."""
 _SIZES = {
     "b": (1,),
     "i": (1, 2, 4, 8),
@@ -46,11 +47,11 @@ class Refused(Exception):
 
 
 class Account:
-    """What one file has made in memory so far, and may still make."""
+    """The memory, in bytes, that one file has used so far, and its limit."""
 
     def __init__(self, disk_bytes: int, max_bytes: int = MAX_BYTES) -> None:
         self.max_bytes = max_bytes
-        self.max_unpacked = min(max_bytes, MAX_UNPACKED_FREELY + MAX_RATIO * disk_bytes)
+        self.max_unpacked = min(max_bytes, MAX_UNPACKED_BYTES + MAX_RATIO * disk_bytes)
         """Bytes that a compressed file may unpack to."""
         # A file is held as a whole while arrays are made of it: half as much again,
         # so that a file of nearly the largest size cannot take twice its size.
@@ -60,13 +61,19 @@ class Account:
         compressed file can be more than its bytes; 5 million take two seconds."""
 
     def check(self, size: int, what: str) -> None:
-        """**Raises:** `Refused` if one thing alone is larger than the budget."""
+        """Checks that one object alone is within the budget.
+
+        **Raises:** `Refused` if it is larger.
+        """
         if size > self.max_bytes:
             limit = f"more than {self.max_bytes / 1e9:.3g} GB"
             raise Refused(f"{what} of {size} bytes ({limit})")
 
     def check_unpacked(self, size: int) -> None:
-        """**Raises:** `Refused` if a compressed file unpacks to too much."""
+        """Checks the size to which a compressed file unpacks.
+
+        **Raises:** `Refused` if it is too large.
+        """
         if size > self.max_unpacked:
             limit = f"{self.max_unpacked / 1e9:.3g} GB for a file of its size"
             raise Refused(f"it unpacks to {size / 1e9:.3g} GB (more than {limit})")
@@ -100,7 +107,7 @@ class ArrayType:
 
 
 def array_type(code: Any) -> ArrayType:
-    """The type that letters such as `<f8`, `|b1` or `S5` stand for.
+    """Returns the type that letters such as `<f8`, `|b1` or `S5` stand for.
 
     **Raises:** `Refused` for every other type.
     """
@@ -121,7 +128,7 @@ def array_type(code: Any) -> ArrayType:
 
 
 def shape_of(value: Any) -> tuple[int, ...]:
-    """A shape that a file gives: whole numbers from 0, for 32 axes at most.
+    """Returns a shape that a file gives: whole numbers from 0, for 32 axes at most.
 
     **Raises:** `Refused` for anything else.
     """
@@ -136,7 +143,7 @@ def shape_of(value: Any) -> tuple[int, ...]:
 
 
 def num_bytes(of: ArrayType, shape: tuple[int, ...], account: Account) -> int:
-    """The bytes that an array takes.
+    """Returns the bytes that an array takes.
 
     **Raises:** `Refused` if they exceed the budget, also by an axis of an empty array.
     """
@@ -152,7 +159,8 @@ def array_of(
     account: Account,
     by_column: bool = False,
 ) -> np.ndarray:
-    """A new array, row by row and in the machine's order of bytes, of `content`.
+    """Returns a new array, row by row and in the machine's order of bytes, of
+    `content`.
 
     A `bytearray` is taken over; of anything else a copy is made.
 
@@ -182,7 +190,8 @@ def array_of(
 
 
 def listed(values: list, shape: tuple[int, ...], account: Account) -> Any:
-    """An array of any values as nested lists; without an axis, the value itself.
+    """Returns an array of any values as nested lists; without an axis, the value
+    itself.
 
     **Raises:** `Damaged` if there are more or fewer values than the shape has.
     """
@@ -242,7 +251,7 @@ def read_header(file: Any) -> tuple[ArrayType, tuple[int, ...], bool, int]:
 
 
 def shown(value: Any) -> str:
-    """What a file says, in one short line of printable characters."""
+    """Returns a value of a file in one short line of printable characters."""
     if isinstance(value, str | int | float | None) or (
         isinstance(value, tuple | list) and all(type(n) is int for n in value[:9])
     ):

@@ -12,23 +12,24 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from bodyslam_jax.geometry.runs import runs
 
-_SAMPLES = 320
-"""Samples along the longer side of the images that are compared."""
-_BLOCK = 16
-"""Samples along a side of the blocks whose mean change is taken."""
-_MOVING = 2.0
-"""Mean change of grey levels in the blocks that change most, from which there is
-motion."""
-_SAME = 0.15
-"""Change of a repeated frame relative to that of its neighbours, at most."""
-_AROUND = 10
-"""Neighbours on each side."""
-_SHORT = 4
-"""Repeats in a row that a conversion makes; more are a freeze, or people who stand."""
+_NUM_SAMPLES = 320
+"""Number of samples along the longer side of the images that are compared."""
+_BLOCK_SAMPLES = 16
+"""Number of samples along a side of the blocks whose mean change is taken."""
+_MIN_MOTION = 2.0
+"""Least mean change of the blocks that change most that counts as motion, grey
+levels."""
+_MAX_REPEAT_RATIO = 0.15
+"""Largest change of a repeated frame relative to that of its neighbours."""
+_NUM_NEIGHBOURS = 10
+"""Number of neighbours on each side."""
+_MAX_CONVERSION_REPEATS = 4
+"""Largest number of consecutive repeats that a conversion makes; more are a freeze, or
+people who stand still."""
 _MIN_REPEATS = 2
-"""Repeats in a video; a single one may be chance."""
-_REGULAR = 0.8
-"""Frames by which a regular conversion may deviate from an even clock."""
+"""Least number of repeats in a video; a single one may be chance."""
+_MAX_CLOCK_DEVIATION = 0.8
+"""Largest deviation of a regular conversion from an even clock, frames."""
 
 
 class Repeats:
@@ -43,7 +44,7 @@ class Repeats:
         """Adds the next image, or `None` for one that cannot be decoded."""
         now = None
         if image is not None:
-            step = max(1, max(image.shape[:2]) // _SAMPLES)
+            step = max(1, max(image.shape[:2]) // _NUM_SAMPLES)
             plane = (
                 image[::step, ::step, 1] if image.ndim == 3 else image[::step, ::step]
             )
@@ -58,14 +59,14 @@ class Repeats:
         self.last = now
 
     def repeated(self) -> Bool[np.ndarray, " t"]:
-        """Which frames repeat the one before."""
+        """Returns which frames repeat the one before."""
         return repeated(np.asarray(self.most), np.asarray(self.typical))
 
 
 def repeated(
     most: Float[np.ndarray, " n"], typical: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " t"]:
-    """Which of n + 1 frames repeat the one before.
+    """Returns which of n + 1 frames repeat the one before.
 
     Args:
         most: change (grey levels) from each frame to the next where most changes: of a
@@ -74,17 +75,17 @@ def repeated(
     """
     found = np.zeros(len(most) + 1, dtype=bool)
     for k, change in enumerate(most):
-        near = most[max(0, k - _AROUND) : k + _AROUND + 1]
+        near = most[max(0, k - _NUM_NEIGHBOURS) : k + _NUM_NEIGHBOURS + 1]
         near = np.sort(near[np.isfinite(near)])
         usual = np.median(near[len(near) // 2 :]) if len(near) else 0.0
-        found[k + 1] = usual >= _MOVING and change < _SAME * usual
+        found[k + 1] = usual >= _MIN_MOTION and change < _MAX_REPEAT_RATIO * usual
     for run in runs(found):
         first, last = run.start, run.stop - 1
         # What moves goes on just before and after; people stop little by little.
         sides = [first - 2, last]  # changes into the frame before, and after the last
         sides = [k for k in sides if 0 <= k < len(most)]
-        moves = typical if last - first + 1 > _SHORT else most
-        if not sides or min(moves[k] for k in sides) < _MOVING:
+        moves = typical if last - first + 1 > _MAX_CONVERSION_REPEATS else most
+        if not sides or min(moves[k] for k in sides) < _MIN_MOTION:
             found[first : last + 1] = False
     if found.sum() < _MIN_REPEATS:
         found[:] = False
@@ -94,7 +95,7 @@ def repeated(
 def without_repeats(
     times: Float[np.ndarray, " t"], found: Bool[np.ndarray, " t"]
 ) -> tuple[Float[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Times (s) of the frames that are new, and which they are.
+    """Returns times (s) and indices of the frames that are new.
 
     Where new frames come as regularly as a conversion gives them, they were taken at
     equal times; otherwise each keeps the time at which it was shown first.
@@ -104,7 +105,7 @@ def without_repeats(
     if len(picks) < 3:
         return kept, picks
     even = np.linspace(picks[0], picks[-1], len(picks))
-    if np.abs(even - picks).max() <= _REGULAR:
+    if np.abs(even - picks).max() <= _MAX_CLOCK_DEVIATION:
         kept = np.linspace(kept[0], kept[-1], len(kept))
     return kept, picks
 
@@ -119,7 +120,7 @@ def repeats_warning(name: str, found: Bool[np.ndarray, " t"], fps: float) -> str
 def _change(a: np.ndarray | None, b: np.ndarray | None) -> tuple[float, float]:
     if a is None or b is None or a.shape != b.shape:
         return np.inf, np.inf
-    size = max(1, a.shape[1] // _BLOCK), max(1, a.shape[0] // _BLOCK)
+    size = max(1, a.shape[1] // _BLOCK_SAMPLES), max(1, a.shape[0] // _BLOCK_SAMPLES)
     blocks = cv2.resize(
         cv2.absdiff(a, b).astype(np.float32), size, interpolation=cv2.INTER_AREA
     )

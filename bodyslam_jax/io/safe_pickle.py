@@ -1,4 +1,4 @@
-"""Pickled files without running what is in them.
+"""Reads pickled files without running the code in them.
 
 Pickle, joblib, PyTorch's zip files and object arrays of NumPy can hold code that runs
 on loading. Here they are unpacked within a budget, and run by an interpreter
@@ -24,13 +24,14 @@ from bodyslam_jax.io.plain_arrays import Account, Damaged, Refused, shown
 
 __all__ = ["StandIn", "restricted_load"]
 
-_BLOCK = 1 << 20
+_BLOCK_BYTES = 1 << 20
 _MAX_INDEX_BYTES = 16_000_000
-"""Of the list of files in a zip archive: some 200,000 names."""
+"""Largest list of files in a zip archive, bytes: some 200,000 names."""
 _LZMA_BYTES = 256 << 20
-"""Working memory of xz and lzma; their highest preset takes 65 MiB."""
+"""Working memory of xz and lzma, bytes; their highest preset takes 65 MiB."""
 _TEXT_PICKLES = (b"(", b"c", b"}", b"]")
-"""How containers and objects begin in protocols 0 and 1, which have no magic number."""
+"""First bytes of containers and objects in protocols 0 and 1, which have no magic
+number."""
 _OLD_TORCH = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."
 
 
@@ -83,7 +84,7 @@ def restricted_load(
 def _load_pickle(
     file: Any, head: bytes, account: Account, stand_ins: tuple[str, ...]
 ) -> Any:
-    """A pickle or joblib's file, compressed or not."""
+    """Loads the file of pickle or joblib, compressed or not."""
     if head.startswith(b'\x04"M\x18'):
         raise Refused(
             "it is packed with lz4, expected zlib, gzip, bz2, xz or no packing"
@@ -101,7 +102,8 @@ def _load_pickle(
 
 
 def _unpacked(file: Any, head: bytes, account: Account) -> bytes | bytearray:
-    """The whole file. joblib's files look like what they are compressed with."""
+    """Returns the whole file, unpacked. joblib's files look like what they are
+    compressed with."""
     unpackers = {
         b"x": zlib.decompressobj,
         b"\x1f\x8b": lambda: zlib.decompressobj(zlib.MAX_WBITS | 16),
@@ -115,7 +117,7 @@ def _unpacked(file: Any, head: bytes, account: Account) -> bytes | bytearray:
     unpacker: Any = make()
     out = bytearray()
     while not unpacker.eof:
-        block = file.read(_BLOCK)
+        block = file.read(_BLOCK_BYTES)
         if not block:
             out += unpacker.flush() if hasattr(unpacker, "flush") else b""
             if unpacker.eof:
@@ -123,7 +125,7 @@ def _unpacked(file: Any, head: bytes, account: Account) -> bytes | bytearray:
             raise Damaged(f"its compressed part is cut short after {len(out)} bytes")
         # What does not fit one step is kept by bz2 and xz, and handed back by zlib.
         while block or not getattr(unpacker, "needs_input", True):
-            out += unpacker.decompress(block, _BLOCK)
+            out += unpacker.decompress(block, _BLOCK_BYTES)
             account.check_unpacked(len(out))
             block = getattr(unpacker, "unconsumed_tail", b"")
             if unpacker.eof:
@@ -132,13 +134,14 @@ def _unpacked(file: Any, head: bytes, account: Account) -> bytes | bytearray:
 
 
 def _taken(file: Any, count: int) -> bytearray:
-    """Exactly `count` bytes, which must be the last; so an archive's checksum is read.
+    """Returns exactly `count` bytes, which must be the last; so an archive's checksum
+    is read.
 
     **Raises:** `Damaged` if there are more or fewer.
     """
     found = bytearray()
     while len(found) <= count:
-        block = file.read(min(_BLOCK, count + 1 - len(found)))
+        block = file.read(min(_BLOCK_BYTES, count + 1 - len(found)))
         if not block:
             break
         found += block
@@ -174,7 +177,7 @@ def _load_array(
 
 
 class _Guarded:
-    """A file of which no reader takes more at once than it needs for its index."""
+    """A file from which readers cannot take more at once than an index needs."""
 
     def __init__(self, file: Any, size: int) -> None:
         self.seek, self.tell, self._file, self._size = file.seek, file.tell, file, size
@@ -198,7 +201,7 @@ def _load_zip(
     stand_ins: tuple[str, ...],
     objects: bool,
 ) -> Any:
-    """A `.pt` of PyTorch 1.6 or later; or an `.npz`, as a dictionary."""
+    """Loads a `.pt` of PyTorch 1.6 or later; or an `.npz`, as a dictionary."""
     with zipfile.ZipFile(_Guarded(file, size)) as archive:  # pyright: ignore
         members = {entry.filename: entry for entry in archive.infolist()}
         if len(members) < len(archive.infolist()):
@@ -248,7 +251,7 @@ class _Torch:
         return Machine(data, 0, self.account, self.stand_ins, self.storage).load()
 
     def storage(self, pid: Any) -> Storage:
-        """The storage that a reference of the pickle names."""
+        """Returns the storage that a reference of the pickle names."""
         if type(pid) is not tuple or len(pid) != 5 or pid[0] != "storage":
             raise Refused("it refers to data outside the file")
         _, kind, key, _, count = pid

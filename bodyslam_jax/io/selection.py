@@ -9,14 +9,15 @@ from bodyslam_jax.config import Known
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.types import DetectedPeople, Sequence, Tracks
 
-_ROUNDING = 1e-6
-"""s, by which a frame's time may be outside the interval."""
+_TIME_TOLERANCE_S = 1e-6
+"""Time by which a frame may be outside the interval, s."""
 
 
 def in_interval(
     name: str, timestamps: Float[np.ndarray, " t"], known: Known
 ) -> Int[np.ndarray, " k"] | None:
-    """Indices of the frames from `known.start` to `known.end` (s); `None` for all.
+    """Returns indices of the frames from `known.start` to `known.end` (s); `None` for
+    all.
 
     **Raises:** `InputError`, naming the video, if there is no frame in the interval.
     """
@@ -24,7 +25,9 @@ def in_interval(
         return None
     start = 0.0 if known.start is None else known.start
     end = np.inf if known.end is None else known.end
-    inside = (timestamps >= start - _ROUNDING) & (timestamps <= end + _ROUNDING)
+    inside = (timestamps >= start - _TIME_TOLERANCE_S) & (
+        timestamps <= end + _TIME_TOLERANCE_S
+    )
     (chosen,) = np.nonzero(inside)
     if not len(chosen):
         raise InputError(
@@ -39,7 +42,8 @@ def times_of_all_frames(
     picks: Int[np.ndarray, " t"] | None,
     num_frames: int,
 ) -> Float[np.ndarray, " n"]:
-    """Times (s) of all frames of a video, of which `timestamps` are those of `picks`.
+    """Returns times (s) of all frames of a video, of which `timestamps` are those of
+    `picks`.
 
     Frames that are left out get interpolated times.
     """
@@ -49,7 +53,8 @@ def times_of_all_frames(
 
 
 def select_frames(sequence: Sequence, picks: Int[np.ndarray, " t"]) -> Sequence:
-    """What was read for all frames of a video, cut to the frames `picks`.
+    """Returns the data that were read for all frames of a video, for the frames
+    `picks`.
 
     `sequence.timestamps` are already those of `picks`.
     """
@@ -81,7 +86,8 @@ def select_frames(sequence: Sequence, picks: Int[np.ndarray, " t"]) -> Sequence:
 
 
 def _cut(people, picks: Int[np.ndarray, " t"]):
-    """Keypoints or bodies, whose arrays have the axes (h, t, ...), at some frames."""
+    """Returns keypoints or bodies, whose arrays have the axes (h, t, ...), at some
+    frames."""
     if people is None:
         return None
     arrays = {k: v for k, v in vars(people).items() if isinstance(v, np.ndarray)}

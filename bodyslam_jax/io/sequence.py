@@ -1,4 +1,4 @@
-"""A folder, video or images, and files about them -> one checked `Sequence`."""
+"""Reads a folder, video or images, and files about them, as one checked `Sequence`."""
 
 import dataclasses
 import logging
@@ -36,11 +36,12 @@ from bodyslam_jax.types import Intrinsics, Sequence, Tracks
 _log = logging.getLogger(__name__)
 
 _MIN_RATE = 8.0
-"""1/s; below it a step, which takes half a second, has fewer than four frames."""
+"""Least frame rate, 1/s; below it a step, which takes half a second, has fewer than
+four frames."""
 _RATE_TOLERANCE = 0.02
 """Relative difference of the frame rates of camera.json and of the video."""
 _DEFAULT_RATE = 30.0
-"""1/s, assumed where no file has a frame rate."""
+"""Frame rate where no file has one, 1/s."""
 
 
 def read_sequence(
@@ -199,7 +200,8 @@ def _read_parts(
 def _look_at_footage(
     parts: Parts, known: Known
 ) -> tuple[Footage | None, Intrinsics | None, float | None]:
-    """The video or images, the calibration, and the frame rate (1/s) that was given.
+    """Returns the video or images, the calibration, and the frame rate (1/s) that was
+    given.
 
     The footage is looked at before the camera file, whose cameras are told apart by the
     images' size; a folder of images again after it, at the frame rate of the file.
@@ -229,8 +231,8 @@ def _intrinsics(
     known: Known,
     warn: Warn,
 ) -> Intrinsics:
-    """The calibration at the size of the video, or a guess; with the user's focal
-    length, if there is one.
+    """Returns the calibration at the size of the video, or a guess; with the user's
+    focal length, if there is one.
 
     **Raises:** `InputError` if the calibration is of another size, or there is neither
     a calibration nor a video.
@@ -279,7 +281,7 @@ def _check_rate(fps: float | None, footage: Footage, warn: Warn) -> None:
 
 
 def _mean_rate(timestamps: np.ndarray) -> float:
-    """Mean frame rate, 1/s; 30 for a single frame."""
+    """Returns the mean frame rate, 1/s; 30 for a single frame."""
     if len(timestamps) < 2:
         return _DEFAULT_RATE
     return (len(timestamps) - 1) / (timestamps[-1] - timestamps[0])
@@ -292,7 +294,8 @@ def _count_frames(
     fps: float,
     config: Association,
 ) -> int:
-    """Frames of a sequence without images: as many as any of its parts has."""
+    """Returns the number of frames of a sequence without images: as many as any of its
+    parts has."""
     found = [int(tracks.frame.max()) + 1] if tracks else []
     quiet = _log.debug  # the files are read again with their length, and warn then
     if parts.keypoints:

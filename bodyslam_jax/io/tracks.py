@@ -12,10 +12,10 @@ from bodyslam_jax.io.frame_index import Warn
 from bodyslam_jax.types import Tracks
 
 _log = logging.getLogger(__name__)
-_MOST_OUTSIDE = 0.1
+_MAX_OUTSIDE_SHARE = 0.1
 """Largest share of the points that may be outside the image."""
-_MIN_FINITE = 0.5
-"""Share of the observations that must be finite."""
+_MIN_FINITE_SHARE = 0.5
+"""Least share of the observations that are finite."""
 
 
 def read_tracks(
@@ -39,7 +39,7 @@ def read_tracks(
     finite = np.isfinite(uv).all(axis=1) & np.isfinite(frame) & np.isfinite(landmark)
     if not finite.all():
         text = f"{int((~finite).sum())} of {len(uv)} observations not finite"
-        if finite.mean() < _MIN_FINITE:
+        if finite.mean() < _MIN_FINITE_SHARE:
             raise InputError(f"{path}: {text}.")
         warn(f"tracks: {text}: left out.")
         frame, landmark, uv = frame[finite], landmark[finite], uv[finite]
@@ -58,14 +58,14 @@ def read_tracks(
         )
     beyond = lambda size: ((uv < -1) | (uv > np.asarray(size))).any(axis=-1).mean()
     outside = beyond(size)
-    if outside > _MOST_OUTSIDE and beyond(size[::-1]) < outside / 10:
+    if outside > _MAX_OUTSIDE_SHARE and beyond(size[::-1]) < outside / 10:
         raise InputError(
             f"the camera file is of {size[0]}x{size[1]} px, but "
             f"{100 * outside:.0f} % of the points of {path} are outside such an image, "
             f"and within {size[1]}x{size[0]} px: are its width and height exchanged, "
             "or the tracks of the image before it was turned?"
         )
-    if outside > _MOST_OUTSIDE:
+    if outside > _MAX_OUTSIDE_SHARE:
         raise InputError(
             f"{path}: {100 * outside:.0f} % of the points outside the image of "
             f"{size[0]}x{size[1]} px: of another video?"

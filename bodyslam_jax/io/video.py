@@ -25,15 +25,17 @@ mp4 mov m4v qt avi mkv webm mpg mpeg mpe m1v m2v mpv mts m2ts m2t ts mod tod vob
 3g2 3gpp wmv asf flv f4v gif ogv ogm ogg divx xvid dv mxf mjpg mjpeg y4m nut rm rmvb
 insv lrv h264 264 avc h265 265 hevc av1 ivf amv dav"""
 VIDEO_SUFFIXES = tuple(f".{name}" for name in _VIDEO_SUFFIXES.split())
-"""Of files that FFmpeg, by which OpenCV reads, takes for videos; in either case."""
-_MIN_SIDE = 16
-"""px; smaller images have no features to track, and BRISK's pyramid fails below 6."""
+"""Suffixes of files that FFmpeg, by which OpenCV reads, takes for videos; in either
+case."""
+_MIN_SIDE_PX = 16
+"""Least side of an image, px; smaller images have no features to track, and BRISK's
+pyramid fails below 6."""
 _MIN_PIXEL_ASPECT = 0.2
-"""Width of a pixel over its height; below it, or above its inverse, the container's
-value is taken for a mistake."""
-_QUARTER, _LARGE = cv2.IMREAD_REDUCED_GRAYSCALE_4, 1000
+"""Least width of a pixel over its height; below it, or above its inverse, the
+container's value is taken for a mistake."""
+_QUARTER_SIZE, _MIN_LARGE_SIDE_PX = cv2.IMREAD_REDUCED_GRAYSCALE_4, 1000
 _MAX_JITTER = 0.25
-"""Spread of frame intervals, relative to their median, that is still a fixed rate."""
+"""Largest spread of frame intervals of a fixed rate, relative to their median."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Footage:
     height: int
     warnings: tuple[str, ...] = ()
     num_read: int = 0
-    """All frames in the file, also those that are left out."""
+    """Number of all frames in the file, also of those that are left out."""
     picks: Int[np.ndarray, " t"] | None = None
     """Indices of the frames that are used; `None` for all."""
     pixel_aspect: float = 1.0
@@ -66,10 +68,10 @@ def look_at(path: Path, fps: float | None = None) -> Footage:
     **Raises:** `InputError`, naming the file, if it is not a readable video.
     """
     footage = _look_at_images(path, fps) if path.is_dir() else _look_at_video(path)
-    if min(footage.width, footage.height) < _MIN_SIDE:
+    if min(footage.width, footage.height) < _MIN_SIDE_PX:
         raise InputError(
             f"{path}: images of {footage.width}x{footage.height} px are too small; "
-            f"expected at least {_MIN_SIDE}x{_MIN_SIDE}."
+            f"expected at least {_MIN_SIDE_PX}x{_MIN_SIDE_PX}."
         )
     return footage
 
@@ -77,7 +79,7 @@ def look_at(path: Path, fps: float | None = None) -> Footage:
 def frames(
     source: Sequence | Path, *, gray: bool = False
 ) -> Iterator[UInt8[np.ndarray, "y x *c"]]:
-    """The images of a sequence in order: BGR, or gray; one in memory at a time.
+    """Yields the images of a sequence in order: BGR, or gray; one in memory at a time.
 
     Of a `Sequence` only the frames it uses, of a file or folder all.
 
@@ -95,7 +97,7 @@ T = TypeVar("T")
 
 
 def picked(items: Iterable[T], picks: Int[np.ndarray, " t"]) -> Iterator[T]:
-    """The `items` at the indices `picks`, which increase."""
+    """Yields the `items` at the indices `picks`, which increase."""
     wanted = set(picks.tolist())
     return (item for k, item in enumerate(items) if k in wanted)
 
@@ -113,19 +115,19 @@ def _read_video(path: Path, gray: bool) -> Iterator[np.ndarray]:
 
 
 def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
-    """Images of a folder in the order of the numbers in their names."""
+    """Returns images of a folder in the order of the numbers in their names."""
     found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes]
     return sorted((p for p in found if not p.name.startswith(".")), key=natural_key)
 
 
 def natural_key(path: Path) -> list[tuple[int, int | str]]:
-    """Sorts `frame_10` after `frame_9`."""
+    """Returns a key that sorts `frame_10` after `frame_9`."""
     parts = re.split(r"(\d+)", path.name)
     return [(0, int(p)) if p.isdigit() else (1, p) for p in parts]
 
 
 def open_video(path: Path) -> cv2.VideoCapture:
-    """The video, opened, after a look at its header; the caller releases it.
+    """Returns the video, opened, after a look at its header; the caller releases it.
 
     **Raises:** `InputError`, naming the file, if it is no video or is of absurd size.
     """
@@ -172,7 +174,7 @@ def _look_at_video(path: Path) -> Footage:
 
 
 def _pixel_aspect(capture: cv2.VideoCapture) -> float:
-    """Width of a pixel over its height, of the images as they are read."""
+    """Returns the width of a pixel over its height, of the images as they are read."""
     across, along = (
         capture.get(p) for p in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN)
     )
@@ -189,7 +191,7 @@ def _pixel_aspect(capture: cv2.VideoCapture) -> float:
 def _timed(
     path: Path, times: Float[np.ndarray, " n"], nominal: float, repeats: Repeats
 ) -> tuple[Float[np.ndarray, " t"], Int[np.ndarray, " t"] | None, tuple[str, ...]]:
-    """`resampled`, without the frames that only repeat the one before."""
+    """Returns `resampled`, without the frames that only repeat the one before."""
     again = repeats.repeated()
     if not again.any():
         return resampled(path, times, nominal)
@@ -206,7 +208,8 @@ def _timed(
 def resampled(
     path: Path, times: Float[np.ndarray, " n"], nominal: float
 ) -> tuple[Float[np.ndarray, " t"], Int[np.ndarray, " t"] | None, tuple[str, ...]]:
-    """Times of the frames that are used (s, from 0), their indices, and warnings.
+    """Returns times of the frames that are used (s, from 0), their indices, and
+    warnings.
 
     Where the rate varies, the frames nearest to the ticks of a clock of the median rate
     are used, which thins out denser parts. No frame is repeated: gaps stay, with their
@@ -237,7 +240,8 @@ def resampled(
 
 
 def at_rate(footage: Footage, fps: float) -> Footage:
-    """All frames of a video file, one every 1/`fps` s, in place of the file's times."""
+    """Returns all frames of a video file, one every 1/`fps` s, in place of the file's
+    times."""
     times = np.arange(footage.num_read) / fps
     kept = tuple(w for w in footage.warnings if "announced" in w)
     return dataclasses.replace(footage, timestamps=times, picks=None, warnings=kept)
@@ -256,7 +260,11 @@ def _look_at_images(folder: Path, fps: float | None) -> Footage:
     repeats = Repeats()
     for path in images:
         # A quarter of the size is decoded in a fraction of the time.
-        flag = _QUARTER if max(width, height) > _LARGE else cv2.IMREAD_GRAYSCALE
+        flag = (
+            _QUARTER_SIZE
+            if max(width, height) > _MIN_LARGE_SIDE_PX
+            else cv2.IMREAD_GRAYSCALE
+        )
         repeats.look(read_image(path, flag))
     stamps, picks, more = _timed(folder, times, fps, repeats)
     return Footage(

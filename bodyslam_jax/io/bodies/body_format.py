@@ -19,12 +19,12 @@ from bodyslam_jax.types import Intrinsics
 
 GROUP = "bodyslam_jax.body_formats"
 """Entry points of this group are formats of other packages."""
-_NOTABLE = 0.02
+_FOCAL_TOLERANCE = 0.02
 """Relative difference of focal lengths from which there is a warning."""
 
 
 def diagonal(camera: Intrinsics) -> float:
-    """Length of the image's diagonal, px."""
+    """Returns the length of the image's diagonal, px."""
     return math.hypot(camera.width, camera.height)
 
 
@@ -41,7 +41,7 @@ class BodyFormat(Format):
     layout: ClassVar[tuple[str, ...] | None] = None
     """Names of the arrays by which `recognises` tells the format from others."""
     by_entry: ClassVar[bool] = False
-    """Whether each entry of the file, such as a person, is a dictionary of these
+    """True if each entry of the file, such as a person, is a dictionary of these
     arrays; otherwise the file itself is."""
 
     def recognises(self, source: Source) -> bool:
@@ -54,24 +54,25 @@ class BodyFormat(Format):
 
     @abc.abstractmethod
     def read(self, source: Source, video: Video) -> Rows:
-        """The bodies of a file that `recognises` accepts.
+        """Returns the bodies of a file that `recognises` accepts.
 
         **Raises:** `InvalidContent`, or any error that a damaged file causes; the
         caller adds the file's name to it.
         """
 
     def focal(self, camera: Intrinsics) -> float | None:
-        """The focal length (px) that the tool assumes for images of the camera's size,
-        where its file has none; `None` for tools that need none."""
+        """Returns the focal length (px) that the tool assumes for images of the
+        camera's size, where its file has none; `None` for tools that need none."""
         return None
 
     def refocused(self, trans: np.ndarray, video: Video) -> np.ndarray:
-        """Positions (m, 3; m) in the video's camera of bodies that the tool put in a
-        camera of its default focal length, with the principal point in the middle of
-        the image. There is a warning if the video's camera has another focal length."""
+        """Returns positions (m, 3; m) in the video's camera of bodies that the tool
+        put in a camera of its default focal length, with the principal point in the
+        middle of the image. There is a warning if the video's camera has another
+        focal length."""
         focal, actual = self.focal(video.camera), float(video.camera.params[0])
         assert focal is not None, f"{self.name} has no default focal length"
-        if abs(focal / actual - 1) > _NOTABLE:
+        if abs(focal / actual - 1) > _FOCAL_TOLERANCE:
             video.warn(
                 f"bodies of {self.name}: no focal length in the file, its default of "
                 f"{focal:.0f} px taken; the camera has {actual:.0f} px, so distances "
@@ -82,7 +83,7 @@ class BodyFormat(Format):
 
 
 def body_formats() -> list[BodyFormat]:
-    """All body formats, of this package and of others."""
+    """Returns all body formats, of this package and of others."""
     package = "bodyslam_jax.io.bodies.formats"
     # The class is abstract, which a type of classes may not be for the checker.
     return formats(BodyFormat, package, GROUP)  # pyright: ignore

@@ -19,13 +19,13 @@ class Rows:
 
     frame: Int[np.ndarray, " m"]
     person: Int[np.ndarray, " m"]
-    """A number for each person, in any order."""
+    """Number of each body's person, in any order."""
     poses: Float[np.ndarray, "m 72"]
     """SMPL's joint rotations, axis-angle, rad; the first is `R_CH` of the root."""
     betas: Float[np.ndarray, "m 10"]
     """SMPL β."""
     trans: Float[np.ndarray, "m 3"]
-    """m: the pelvis is at `J_0(β) + trans`."""
+    """Translation, m: the pelvis is at `J_0(β) + trans`."""
     shapes_regressed: bool = True
     """As in `Bodies`."""
 
@@ -36,17 +36,17 @@ class Video:
 
     camera: Intrinsics
     num_frames: int | None = None
-    """`None` if it is that of the file."""
+    """Number of frames; `None` if it is that of the file."""
     fps: float | None = None
-    """1/s; None if not known"""
+    """Frame rate, 1/s; `None` if unknown."""
     times: Float[np.ndarray, " t"] | None = None
-    """s, of every frame; None if not known"""
+    """Time of every frame, s; `None` if unknown."""
     images: tuple[str, ...] = ()
-    """Names of the frames, if it is a folder of images."""
+    """Names of the frames, if the video is a folder of images."""
     config: Association = Association()
     warn: Warn = _log.warning
 
     def frames_in(self, seconds: float) -> int:
-        """The number of frames in so many seconds, at least 1; at 30/s if the video's
-        rate is not known."""
+        """Returns the number of frames in so many seconds, at least 1; at 30/s if the
+        video's rate is not known."""
         return max(1, round(seconds * (self.fps or 30.0)))

@@ -1,4 +1,4 @@
-"""What readers of regressed bodies share: checks, frames, rotations, cameras.
+"""Functions that readers of regressed bodies share: checks, frames, rotations, cameras.
 
 Errors are `InvalidContent`, to which the caller adds the file's name.
 """
@@ -23,15 +23,17 @@ PELVIS_SMPL = np.array([-0.0018, -0.2233, 0.0282])
 """J_0 of SMPL's neutral template, m."""
 PELVIS_SMPLX = np.array([0.0031, -0.3514, 0.0120])
 """J_0 of SMPL-X's neutral template, m."""
-_NOWHERE = Path("bodies")
+_NO_FILE = Path("bodies")
 _GENDERS = {"f": "female", "m": "male", "n": "neutral"}
 _GENDERS |= {gender: gender for gender in _GENDERS.values()}
-_BOX = np.stack(np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.85, 0.85, 5)))
-"""Grid of the size of a body about its middle, in the plane of the image, m."""
+_BODY_GRID_M = np.stack(
+    np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.85, 0.85, 5))
+)
+"""Grid of the size of a body around its middle, in the plane of the image, m."""
 
 
 def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarray:
-    """A float64 array of the given shape (-1: any length).
+    """Returns a float64 array of the given shape (-1: any length).
 
     Values that are not finite become NaN; the reader leaves out their bodies.
 
@@ -44,9 +46,9 @@ def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarra
     if isinstance(value, np.ndarray) and value.dtype.kind == "O":
         value = value.tolist()
     try:
-        array = as_array(_NOWHERE, key, value, finite=False)
+        array = as_array(_NO_FILE, key, value, finite=False)
     except InputError as error:  # the caller knows the file
-        text = str(error).removeprefix(f"{_NOWHERE}: ").rstrip(".")
+        text = str(error).removeprefix(f"{_NO_FILE}: ").rstrip(".")
         raise InvalidContent(text) from None
     array = np.where(np.isfinite(array), array, np.nan)
     if shape is not None:
@@ -60,7 +62,7 @@ def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarra
 
 
 def betas_of(data: dict, key: str, n: int) -> np.ndarray:
-    """The first ten β of each of `n` bodies; one row may stand for all."""
+    """Returns the first ten β of each of `n` bodies; one row may stand for all."""
     betas = np.atleast_1d(numbers_of(data, key, None))
     if betas.size == 0 or betas.size // betas.shape[-1] not in (1, n):
         raise InvalidContent(f"`{key}` is {betas.shape}, not (10,) or ({n}, 10)")
@@ -73,7 +75,7 @@ def betas_of(data: dict, key: str, n: int) -> np.ndarray:
 
 
 def whole_of(array: np.ndarray, name: str) -> np.ndarray:
-    """Numbers of frames or people as integers.
+    """Returns numbers of frames or people as integers.
 
     **Raises:** `InvalidContent` if one is not a whole number.
     """
@@ -84,14 +86,14 @@ def whole_of(array: np.ndarray, name: str) -> np.ndarray:
 
 
 def people_of(data: dict, n: int) -> np.ndarray:
-    """The number of each body's person; all 0 if the file has none."""
+    """Returns the number of each body's person; all 0 if the file has none."""
     if "person" not in data:
         return np.zeros(n, dtype=np.int64)
     return whole_of(numbers_of(data, "person", (n,)), "person")
 
 
 def frames_of(data: dict, key: str, n: int, num_frames: int | None) -> np.ndarray:
-    """The frame of each of `n` bodies; without `key`, one body per frame."""
+    """Returns the frame of each of `n` bodies; without `key`, one body per frame."""
     if key in data:
         found = whole_of(np.ravel(numbers_of(data, key, None)), key)
         if len(found) != n:
@@ -105,7 +107,7 @@ def frames_of(data: dict, key: str, n: int, num_frames: int | None) -> np.ndarra
 
 
 def frames_of_images(names: list[str], video: Video, *, complete: bool) -> np.ndarray:
-    """The frame of each body, from the name of its image."""
+    """Returns the frame of each body, from the name of its image."""
     frames = frames_of_names(
         names,
         what="bodies",
@@ -118,8 +120,8 @@ def frames_of_images(names: list[str], video: Video, *, complete: bool) -> np.nd
 
 
 def tell_apart(frame: np.ndarray, trans: np.ndarray, video: Video) -> np.ndarray:
-    """Numbers of people, (m,), for a tool that does not track them: by position and
-    size in the image. With at most one body per frame it is one person."""
+    """Returns numbers of people, (m,), for a tool that does not track them: by position
+    and size in the image. With at most one body per frame there is one person."""
     if len(np.unique(frame)) == len(frame):
         return np.zeros(len(frame), dtype=np.int64)
     if (busiest := np.unique(frame, return_counts=True)[1].max()) > MAX_PEOPLE:
@@ -130,8 +132,8 @@ def tell_apart(frame: np.ndarray, trans: np.ndarray, video: Video) -> np.ndarray
     order = np.argsort(frame, kind="stable")
     x, y, z = trans[order].T[:, :, None]
     z = np.maximum(z, 0.1)
-    u = fx * (x + _BOX[0].ravel()) / z + cx
-    v = fy * (y + _BOX[1].ravel()) / z + cy
+    u = fx * (x + _BODY_GRID_M[0].ravel()) / z + cx
+    v = fy * (y + _BODY_GRID_M[1].ravel()) / z + cy
     points = np.stack([u, v, np.ones_like(u)], axis=-1)
     points[~np.isfinite(points).all(axis=-1)] = 0.0
     first = np.searchsorted(frame[order], np.arange(1, frame.max(initial=0) + 1))
@@ -142,7 +144,8 @@ def tell_apart(frame: np.ndarray, trans: np.ndarray, video: Video) -> np.ndarray
 
 
 def as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
-    """Axis-angle (m, 3j), rad, from rotation matrices (m, j, 3, 3) or (j, 3, 3).
+    """Returns axis-angle (m, 3j), rad, from rotation matrices (m, j, 3, 3) or (j, 3,
+    3).
 
     An array that already is axis-angle is returned unchanged.
     """
@@ -170,14 +173,14 @@ def rotations_of(data: dict, key: str, joints: int) -> np.ndarray:
 
 
 def middle(camera: Intrinsics) -> np.ndarray:
-    """Principal point of tools that put it in the middle of the image, px."""
+    """Returns the principal point (px) of tools that put it in the image's middle."""
     return np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
 
 
 def refocused(
     trans: np.ndarray, focal: np.ndarray, center: np.ndarray, camera: Intrinsics
 ) -> np.ndarray:
-    """Positions (m) at which bodies have the same image in the true camera.
+    """Returns positions (m) at which bodies have the same image in the true camera.
 
     For the same size in the image, distance is proportional to the focal length.
 
@@ -198,7 +201,7 @@ def refocused(
 
 
 def at_size(K: Float[np.ndarray, "n 3 3"], video: Video) -> Float[np.ndarray, "n 3 3"]:
-    """A tool's camera matrices, for images of the video's size.
+    """Returns a tool's camera matrices, for images of the video's size.
 
     A tool that resized the images has its principal point in the middle of images of
     another size and the same aspect ratio.
@@ -217,7 +220,7 @@ def at_size(K: Float[np.ndarray, "n 3 3"], video: Video) -> Float[np.ndarray, "n
 
 
 def focals(K: np.ndarray) -> np.ndarray:
-    """fx and fy of each camera matrix, (n, 2), px."""
+    """Returns fx and fy of each camera matrix, (n, 2), px."""
     return np.stack([K[:, 0, 0], K[:, 1, 1]], axis=-1)
 
 
@@ -230,8 +233,8 @@ def from_crops(
     box: np.ndarray,
     camera: Intrinsics,
 ) -> Rows:
-    """Bodies given in weak perspective (s, tx, ty) of square boxes (cx, cy, side px),
-    with root rotations relative to the crop's ray."""
+    """Returns bodies given in weak perspective (s, tx, ty) of square boxes (cx, cy,
+    side px), with root rotations relative to the crop's ray."""
     if (crop[:, 0] <= 0).any() or (box[:, 2] <= 0).any():
         raise InvalidContent(
             "a weak-perspective camera or box with a size of 0 or less"
@@ -244,7 +247,7 @@ def from_crops(
 
 
 def join(rows: list[Rows]) -> Rows:
-    """The bodies of several people in one table."""
+    """Returns the bodies of several people in one table."""
     if not rows:
         raise InvalidContent("no person in it")
     names = ("frame", "person", "poses", "betas", "trans")
@@ -255,15 +258,16 @@ def join(rows: list[Rows]) -> Rows:
 
 
 def gender_of(value: Any) -> str | None:
-    """`female`, `male` or `neutral`, from text, bytes or an array of one of them."""
+    """Returns `female`, `male` or `neutral`, from text, bytes or an array of one of
+    them."""
     value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
     text = value.decode("latin1") if isinstance(value, bytes) else str(value)
     return _GENDERS.get(text.strip().lower())
 
 
 def genders_in(value: Any) -> tuple[set[str], set[str]]:
-    """The genders in a file's entry, of one person or of each: those that are known,
-    and other words."""
+    """Returns the genders in a file's entry, of one person or of each: those that are
+    known, and other words."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, np.ndarray):

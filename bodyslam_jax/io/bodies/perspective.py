@@ -12,8 +12,8 @@ from jaxtyping import Float
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.types import Intrinsics
 
-_SMALLEST = 1e-9
-"""px; avoids a division by 0, and is far below the size of any person."""
+_MIN_SIZE_PX = 1e-9
+"""Least size, px, which avoids a division by 0; far below that of any person."""
 
 
 def full_translation(
@@ -21,14 +21,15 @@ def full_translation(
     box: Float[np.ndarray, "m 3"],
     intrinsics: Intrinsics,
 ) -> Float[np.ndarray, "m 3"]:
-    """`trans` (m) of bodies given as `(s, tx, ty)` in square boxes `(cx, cy, side px)`.
+    """Returns `trans` (m) of bodies given as `(s, tx, ty)` in square boxes `(cx, cy,
+    side px)`.
 
     Distortion is ignored: it moves a box's centre, whose own error is larger.
     """
     fx, fy, px, py = intrinsics.params[:4]
     s, tx, ty = camera.T
     cx, cy, side = box.T
-    scale = side * s + _SMALLEST
+    scale = side * s + _MIN_SIZE_PX
     z = 2 * fx / scale
     x = tx + 2 * (cx - px) / scale
     # With fx != fy a row of the crop spans fx / fy as many metres as a column.
@@ -41,7 +42,7 @@ def crop_camera(
     box: Float[np.ndarray, "m 3"],
     intrinsics: Intrinsics,
 ) -> Float[np.ndarray, "m 3"]:
-    """Inverse of `full_translation`: the network's `(s, tx, ty)`."""
+    """Returns the inverse of `full_translation`: the network's `(s, tx, ty)`."""
     fx, fy, px, py = intrinsics.params[:4]
     x, y, z = trans.T
     cx, cy, side = box.T
@@ -54,8 +55,8 @@ def turn_to_camera(
     box: Float[np.ndarray, "m 3"],
     intrinsics: Intrinsics,
 ) -> Float[np.ndarray, "m 3"]:
-    """Root rotations (axis-angle, rad) in the camera, of those relative to each crop's
-    ray; NaN where a rotation or box is not finite.
+    """Returns root rotations (axis-angle, rad) in the camera, of those relative to each
+    crop's ray; NaN where a rotation or box is not finite.
 
     The pelvis does not move: rotations pivot at `J_0(β) + trans`.
     """

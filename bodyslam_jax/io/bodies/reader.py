@@ -24,12 +24,13 @@ from bodyslam_jax.types import Bodies, Intrinsics
 
 _log = logging.getLogger(__name__)
 
-_MAX_DISTANCE = 200.0
-"""Of a body from the camera, m; further away, `trans` is in another unit."""
+_MAX_DISTANCE_M = 200.0
+"""Largest distance of a body from the camera, m; further away, `trans` is in another
+unit."""
 _MAX_BETA = 100.0
-"""Standard deviations of SMPL's shapes; those of people are within 5."""
-_MIN_FINITE = 0.5
-"""Share of the bodies that must be finite."""
+"""Largest β, in standard deviations of SMPL's shapes; those of people are within 5."""
+_MIN_FINITE_SHARE = 0.5
+"""Least share of the bodies that are finite."""
 
 
 def read_bodies(
@@ -71,7 +72,7 @@ def read_bodies(
 
 
 def _arrays(path: Path) -> dict:
-    """The named arrays of a file.
+    """Returns the named arrays of a file.
 
     **Raises:** `InputError`, naming the file, if it has none.
     """
@@ -84,7 +85,8 @@ def _arrays(path: Path) -> dict:
 
 
 def _gender(data: Any, warn: Warn) -> str | None:
-    """The gender of the model that all bodies of a file belong to, if it is one."""
+    """Returns the gender of the model that all bodies of a file belong to, if it is
+    one."""
     found = data.get("gender") if isinstance(data, dict) else None
     known, other = genders_in(found)
     if other:
@@ -99,7 +101,8 @@ def _gender(data: Any, warn: Warn) -> str | None:
 
 
 def _finite(path: Path, rows: Rows, warn: Warn) -> Rows:
-    """The bodies that are finite; others are absent in their frames, with a warning.
+    """Returns the bodies that are finite; others are absent in their frames, with a
+    warning.
 
     **Raises:** `InputError` if most are not finite.
     """
@@ -110,7 +113,7 @@ def _finite(path: Path, rows: Rows, warn: Warn) -> Rows:
         return rows
     broken = " and ".join(f"`{name}`" for name in names if not fine[name].all())
     text = f"{broken} has NaN or infinity in {(~kept).sum()} of {len(kept)} bodies"
-    if kept.mean() < _MIN_FINITE:
+    if kept.mean() < _MIN_FINITE_SHARE:
         raise InputError(f"{path}: {text}.")
     warn(f"{text}: taken as absent in those frames.")
     arrays = {n: getattr(rows, n)[kept] for n in ("frame", "person", *names)}
@@ -147,7 +150,7 @@ def _gather(
             f"{path}: bodies of frames {low} to {high}, but the video has {num_frames}."
         )
     distance = float(np.linalg.norm(rows.trans, axis=-1).max())
-    if distance > _MAX_DISTANCE:
+    if distance > _MAX_DISTANCE_M:
         raise InputError(f"{path}: a body {distance:.0f} m away; `trans` is in m.")
     if (rows.trans[:, 2] < -0.5).all():
         raise InputError(f"{path}: all bodies behind the camera; z is forward.")

@@ -29,13 +29,13 @@ CAMERA_FILES = ("camera_matrix.csv", "metadata.json", "metadata")
 _COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 _RECORD3D = "Record3D's metadata"
 _MAX_TIME = 1e19
-"""A time in nanoseconds since 1970 has 19 digits."""
+"""Largest time: in nanoseconds since 1970 it has 19 digits."""
 _TO_OPENCV = np.array([1.0, -1.0, -1.0])
 """Signs of the camera's axes, from y up and z back to y down and z forward."""
 
 
 def is_path(path: Path) -> bool:
-    """Whether a file holds poses of one of these recorders."""
+    """Returns True if a file holds poses of one of these recorders."""
     return (
         path.suffix == ".r3d"
         or path.name == "metadata"
@@ -45,7 +45,7 @@ def is_path(path: Path) -> bool:
 
 
 def is_camera(path: Path) -> bool:
-    """Whether a file holds intrinsics of one of these recorders."""
+    """Returns True if a file holds intrinsics of one of these recorders."""
     return path.name == "camera_matrix.csv" or (
         path.name != "odometry.csv" and is_path(path)
     )
@@ -54,7 +54,7 @@ def is_camera(path: Path) -> bool:
 def read_arkit_poses(
     path: Path,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"]]:
-    """Times since the first pose (s) and poses T_WC (m, OpenCV's axes).
+    """Returns times since the first pose (s) and poses T_WC (m, OpenCV's axes).
 
     **Raises:** `InputError`, naming the file, if it is of none of these recorders.
     """
@@ -81,7 +81,8 @@ def read_arkit_poses(
 
 
 def read_arkit_camera(path: Path, size: tuple[int, int] | None) -> FoundCamera:
-    """The camera of a recording; Stray Scanner's file lacks the image's `size`, px.
+    """Returns the camera of a recording; Stray Scanner's file lacks the image's `size`,
+    px.
 
     **Raises:** `InputError`, naming the file, if it is of none of these recorders.
     """
@@ -119,7 +120,7 @@ def _check_times(path: Path, times: Float[np.ndarray, " n"]) -> None:
 
 
 def _numbers(path: Path, rows: list[list[str]]) -> Float[np.ndarray, "n m"]:
-    """A table of numbers."""
+    """Returns a table of numbers."""
     with reading(path, "a table of numbers"):
         table = np.array([[float(word) for word in row] for row in rows], float)
     return as_array(path, "table", table, (None, None), high=_MAX_TIME)

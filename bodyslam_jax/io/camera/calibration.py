@@ -22,14 +22,14 @@ from bodyslam_jax.types import Intrinsics
 
 _log = logging.getLogger(__name__)
 
-_GUESSED_FOCAL = 1.2
+_GUESSED_FOCAL_RATIO = 1.2
 """Focal length over the longer side: COLMAP's default, a field of view of 45
 degrees."""
 
-MAX_SIDE = 1_000_000
-"""Width or height of an image, px, at most: more than any format can hold."""
-_MAX_PARAMETER = 1e8
-"""A focal length, in px, of a hundred times the widest image."""
+MAX_SIDE_PX = 1_000_000
+"""Largest width or height of an image, px: more than any format can hold."""
+_MAX_PARAMETER_PX = 1e8
+"""Largest parameter, px: a focal length of a hundred times the widest image."""
 _IN_FOLDERS = ("cameras.bin", "cameras.txt", "transforms.json", "camera.json")
 _IN_FOLDERS = (*_IN_FOLDERS, *arkit.CAMERA_FILES, "calib.txt")
 """Names of cameras' files, by which they are found in a folder."""
@@ -88,7 +88,7 @@ def read_camera(
         raise InputError(f"{path}: no {', '.join(missing)}; only {found}.")
     model = data.text("model", among=tuple(_NUM_PARAMS))
     params = data.array("params", (None,))
-    width, height = (data.whole(k, 1, MAX_SIDE) for k in ("width", "height"))
+    width, height = (data.whole(k, 1, MAX_SIDE_PX) for k in ("width", "height"))
     if len(params) != _NUM_PARAMS[model]:
         raise InputError(
             f"{path}: {len(params)} params for {model}, not {_NUM_PARAMS[model]}."
@@ -99,7 +99,8 @@ def read_camera(
 
 
 def split_camera_name(path: Path) -> tuple[Path, str | None]:
-    """A file, and the name behind its last colon, if there is no file of that name."""
+    """Returns a file, and the name behind its last colon if the file with the colon
+    does not exist."""
     if path.exists() or ":" not in path.name:
         return path, None
     file, _, name = path.name.rpartition(":")
@@ -109,7 +110,7 @@ def split_camera_name(path: Path) -> tuple[Path, str | None]:
 def _from_cameras(
     path: Path, cameras: list[FoundCamera], size: tuple[int, int] | None
 ) -> Intrinsics:
-    """The video's camera, by its size (px), among those of a file."""
+    """Returns the video's camera, by its size (px), among those of a file."""
     fitting = [c for c in cameras if size in (None, (c.width, c.height))]
     chosen = fitting or cameras
     same = {(c.model, c.width, c.height, tuple(c.params)) for c in chosen}
@@ -130,7 +131,7 @@ def _from_cameras(
 def _intrinsics(
     path: Path, model: str, params: np.ndarray, width: int, height: int
 ) -> Intrinsics:
-    """Checked intrinsics in OpenCV's model.
+    """Returns checked intrinsics in OpenCV's model.
 
     **Raises:** `InputError`, naming the file, if no camera has such parameters.
     """
@@ -139,9 +140,9 @@ def _intrinsics(
         raise InputError(f"{path}: {params.size} params for {model}, not {expected}.")
     params = _from_colmap(model, params)
     is_camera = np.isfinite(params).all() and (params[:2] > 0).all()
-    if not is_camera or np.abs(params).max() > _MAX_PARAMETER:
+    if not is_camera or np.abs(params).max() > _MAX_PARAMETER_PX:
         raise InputError(f"{path}: params {params.tolist()} are not those of a camera.")
-    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+    if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX):
         raise InputError(f"{path}: size {width}x{height} px is not that of an image.")
     if not (-width < params[2] < 2 * width and -height < params[3] < 2 * height):
         raise InputError(
@@ -154,22 +155,23 @@ def _intrinsics(
 def guess_camera(
     width: int, height: int, image: Path | None = None, pixel_aspect: float = 1.0
 ) -> Intrinsics:
-    """Intrinsics of an unknown camera: from the EXIF data of `image`, else typical.
+    """Returns intrinsics of an unknown camera: from the EXIF data of `image`, else
+    typical.
 
     Args:
         pixel_aspect: width of a pixel over its height.
     """
     longer = max(width * pixel_aspect, height)
     focal = _focal_from_exif(image, longer) if image else None
-    focal = focal or _GUESSED_FOCAL * longer
+    focal = focal or _GUESSED_FOCAL_RATIO * longer
     centre = (width - 1) / 2, (height - 1) / 2
     params = np.array([focal / pixel_aspect, focal, *centre])
     return Intrinsics(params, width, height, is_guess=True)
 
 
 def with_focal(intrinsics: Intrinsics, focal: float, sigma: float) -> Intrinsics:
-    """The camera with the focal length fx given by the user (px, standard deviation
-    `sigma`); fy keeps its ratio to fx."""
+    """Returns the camera with the focal length fx given by the user (px, standard
+    deviation `sigma`); fy keeps its ratio to fx."""
     params = intrinsics.params.copy()
     params[:2] *= focal / params[0]
     return dataclasses.replace(
@@ -178,8 +180,8 @@ def with_focal(intrinsics: Intrinsics, focal: float, sigma: float) -> Intrinsics
 
 
 def project_points(intrinsics: Intrinsics, p_C: np.ndarray) -> np.ndarray:
-    """Pixels (m, 2) of points (m, 3) in the camera frame, m; points behind the camera
-    are projected far outside the image."""
+    """Returns pixels (m, 2) of points (m, 3) in the camera frame, m; points behind the
+    camera are projected far outside the image."""
     front = p_C[:, 2] > 0.05
     safe = np.where(front[:, None], p_C, [0.0, 0.0, 1.0])
     K, distortion = as_opencv(intrinsics.params)
@@ -190,7 +192,7 @@ def project_points(intrinsics: Intrinsics, p_C: np.ndarray) -> np.ndarray:
 def rays(
     uv: np.ndarray, K: np.ndarray, distortion: np.ndarray
 ) -> Float[np.ndarray, "m 2"]:
-    """x/z and y/z of pixels (m, 2), distortion undone.
+    """Returns x/z and y/z of pixels (m, 2), with the distortion undone.
 
     With up to 100 iterations: OpenCV's default of five leaves errors of up to 25 px at
     the edge of a wide lens.
@@ -204,7 +206,7 @@ def rays(
 
 
 def as_opencv(params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Camera matrix and distortion coefficients, as cv2 wants them."""
+    """Returns camera matrix and distortion coefficients as cv2 expects them."""
     fx, fy, cx, cy = params[:4]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     return K, params[4:] if len(params) == 8 else np.zeros(4)
@@ -224,7 +226,8 @@ def _from_colmap(model: str, params: np.ndarray) -> np.ndarray:
 
 
 def _focal_from_exif(image: Path, longer_side: float) -> float | None:
-    """px, from the 35 mm equivalent in EXIF data; `None` if there is none."""
+    """Returns the focal length, px, from the 35 mm equivalent in EXIF data; `None`
+    without it."""
     equivalent = exif_focal_35mm(image)
     if equivalent is None:
         return None

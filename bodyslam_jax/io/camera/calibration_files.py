@@ -71,7 +71,7 @@ class NamedCamera:
 
 
 def read_named_cameras(path: Path) -> list[NamedCamera] | None:
-    """The cameras of a file of one of these kinds; `None` if it is of another.
+    """Returns the cameras of a file of one of these kinds; `None` if it is of another.
 
     **Raises:** `InputError`, naming the file, if it is of one of these kinds but
     something is missing or impossible.
@@ -113,7 +113,7 @@ def read_named_cameras(path: Path) -> list[NamedCamera] | None:
 def to_opencv_params(
     path: Path, camera: NamedCamera, size: tuple[int, int]
 ) -> list[float]:
-    """`fx fy cx cy`, and `k1 k2 p1 p2` if the camera is distorted.
+    """Returns `fx fy cx cy`, and `k1 k2 p1 p2` if the camera is distorted.
 
     A model with more coefficients is fitted by these within the image of `size`, px.
 
@@ -160,7 +160,7 @@ def _fitted(
     distortion: Float[np.ndarray, " d"],
     size: tuple[int, int],
 ) -> Float[np.ndarray, " 4"]:
-    """k1 k2 p1 p2 that are nearest to a richer model within the image."""
+    """Returns k1 k2 p1 p2 that are nearest to a richer model within the image."""
     u, v = np.meshgrid(np.linspace(0, size[0] - 1, 25), np.linspace(0, size[1] - 1, 25))
     uv = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-8)
@@ -191,7 +191,7 @@ def _fitted(
 
 
 def _numbers(text: str) -> list[list[float]] | None:
-    """Rows of numbers; `None` if anything else is in the text."""
+    """Returns rows of numbers; `None` if anything else is in the text."""
     rows = []
     for line in text.splitlines():
         words = re.sub(r"[\[\](),;]", " ", line.partition("#")[0]).split()
@@ -205,7 +205,7 @@ def _numbers(text: str) -> list[list[float]] | None:
 
 
 def _of_numbers(path: Path, values: Any) -> NamedCamera:
-    """A camera from a matrix, or from `fx fy cx cy [k1 k2 [p1 p2 [k3]]]`."""
+    """Returns a camera from a matrix, or from `fx fy cx cy [k1 k2 [p1 p2 [k3]]]`."""
     values = as_array(path, "camera", values)
     flat = values.ravel()
     square = values.shape in ((3, 3), (3, 4), (4, 4))
@@ -224,7 +224,7 @@ def _of_numbers(path: Path, values: Any) -> NamedCamera:
 
 
 def _matrix(path: Path, values: Any, place: str = "camera matrix") -> np.ndarray:
-    """A checked camera matrix, px, from one of 3 x 3, 3 x 4 or 4 x 4."""
+    """Returns a checked camera matrix, px, from one of 3 x 3, 3 x 4 or 4 x 4."""
     if isinstance(values, dict):  # OpenCV's and ROS's: rows, cols, data
         held = fields(path, values, place)
         rows, columns = held.whole("rows", 1, 4), held.whole("cols", 1, 4)
@@ -262,7 +262,8 @@ def _matrix(path: Path, values: Any, place: str = "camera matrix") -> np.ndarray
 
 
 def _of_names(data: Fields, name: str | None = None) -> NamedCamera:
-    """A camera from a matrix and coefficients, or from fx, fy, cx, cy, by name."""
+    """Returns a camera from a matrix and coefficients, or from fx, fy, cx, cy, by
+    name."""
     path = data.path
     if any(data.data.get(one) is not None for one in _MATRIX):
         found = data.value(*_MATRIX)
@@ -309,7 +310,7 @@ def _coefficients(path: Path, values: Any) -> Float[np.ndarray, " d"]:
 
 
 def _listed(data: Fields, prefix: str) -> Float[np.ndarray, " 5"]:
-    """k1 k2 p1 p2 k3 under names of their own."""
+    """Returns k1 k2 p1 p2 k3 under names of their own."""
     names = [prefix + n for n in ("k1", "k2", "p1", "p2", "k3")]
     return np.array(
         [data.number(n) if data.data.get(n) is not None else 0.0 for n in names]
@@ -393,7 +394,7 @@ def _of_xml(path: Path) -> list[NamedCamera]:
 
 
 def _opencv_value(path: Path, node: ElementTree.Element) -> Any:
-    """A value of OpenCV's FileStorage: a matrix, a number or a text."""
+    """Returns a value of OpenCV's FileStorage: a matrix, a number or a text."""
     if node.get("type_id") == "opencv-matrix":
         words = (node.findtext("data") or "").split()
         with reading(path, f"numbers in <{node.tag[:40]}>"):
@@ -408,7 +409,8 @@ def _opencv_value(path: Path, node: ElementTree.Element) -> Any:
 
 
 def _qualisys(path: Path, camera: ElementTree.Element, k: int) -> NamedCamera:
-    """One camera of Qualisys' file: parts of a pixel, of the whole sensor, to px."""
+    """Returns one camera of Qualisys' file: parts of a pixel, of the whole sensor, to
+    px."""
     name = camera.get("serial") or str(k)
     turned = camera.get("viewrotation") or "0"
     if turned not in ("0", "0.0"):
@@ -434,7 +436,7 @@ def _qualisys(path: Path, camera: ElementTree.Element, k: int) -> NamedCamera:
         return value
 
     def window(tag: str) -> np.ndarray | None:
-        """left, top, right, bottom: numbers of the first and last pixels."""
+        """Returns left, top, right, bottom: numbers of the first and last pixels."""
         node = camera.find(tag)
         if node is None:
             return None
@@ -489,7 +491,7 @@ def choose_camera(
     size: tuple[int, int] | None,
     video: str,
 ) -> NamedCamera:
-    """The camera of the video among those of a file.
+    """Returns the camera of the video among those of a file.
 
     Args:
         wanted: its name, or its number from 0, as the user gave it.

@@ -20,8 +20,9 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.declared import Fields, as_array, shown
 from bodyslam_jax.io.files import read_bytes, read_json_fields, read_lines, reading
 
-_HALF = 0.5
-"""px that COLMAP's pixel coordinates exceed those with centres at whole numbers."""
+_HALF_PIXEL = 0.5
+"""Difference of COLMAP's pixel coordinates to those with centres at whole numbers,
+px."""
 _TRANSFORMS = "nerfstudio's transforms.json"
 _MODELS = (
     ("SIMPLE_PINHOLE", 3),
@@ -36,7 +37,7 @@ _MODELS = (
     ("RADIAL_FISHEYE", 5),
     ("THIN_PRISM_FISHEYE", 12),
 )
-"""By COLMAP's model number: name, and number of parameters."""
+"""Name and number of parameters of each model, by COLMAP's number."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,11 +48,11 @@ class FoundCamera:
     width: int
     height: int
     params: list[float]
-    """In COLMAP's order; px, and distortion coefficients."""
+    """Parameters in COLMAP's order: px, and distortion coefficients."""
 
 
 def read_cameras(path: Path) -> list[FoundCamera]:
-    """Cameras of `cameras.txt`, `cameras.bin` or `transforms.json`.
+    """Returns cameras of `cameras.txt`, `cameras.bin` or `transforms.json`.
 
     **Raises:** `InputError`, naming the file, if it is none of these.
     """
@@ -66,7 +67,7 @@ def read_cameras(path: Path) -> list[FoundCamera]:
 
 
 def read_poses(path: Path) -> tuple[list[str], Float[np.ndarray, "n 4 4"]]:
-    """Names of images and their poses T_WC, of `images.txt`, `images.bin` or
+    """Returns names of images and their poses T_WC, of `images.txt`, `images.bin` or
     `transforms.json`.
 
     **Raises:** `InputError`, naming the file, if it is none of these.
@@ -106,13 +107,13 @@ def _centred(path: Path, camera: FoundCamera) -> FoundCamera:
 
 
 def _from_corner(cx: float, cy: float) -> list[float]:
-    """The principal point, with centres of pixels at whole numbers.
+    """Returns the principal point for pixel centres at whole numbers.
 
-    That of a file in units of the image stays as it is, to be told and refused.
+    One that is in units of the image stays as it is, and is refused later.
     """
     if max(abs(cx), abs(cy)) <= 1:
         return [cx, cy]
-    return [cx - _HALF, cy - _HALF]
+    return [cx - _HALF_PIXEL, cy - _HALF_PIXEL]
 
 
 def _lines(path: Path) -> Iterator[str]:
@@ -128,7 +129,8 @@ def _text(path: Path) -> Iterator[FoundCamera]:
 
 
 def _images(path: Path) -> Iterator[tuple[str, list[float]]]:
-    """Lines alternate between an image and its points, which may be empty."""
+    """Yields names and poses of `images.txt`, whose lines alternate between an image
+    and its points, which may be empty."""
     for line in list(_lines(path))[::2]:
         if line:
             words = line.split(maxsplit=9)
@@ -136,7 +138,7 @@ def _images(path: Path) -> Iterator[tuple[str, list[float]]]:
 
 
 class _Reader:
-    """Little-endian numbers, one after the other."""
+    """Reads consecutive little-endian numbers."""
 
     def __init__(self, path: Path) -> None:
         self.data, self.at = read_bytes(path, "COLMAP's binary file"), 0
@@ -175,7 +177,7 @@ def _nerfstudio_camera(data: Fields) -> FoundCamera:
     frames = list(data.each("frames")) if "frames" in data else []
 
     def of(name: str) -> Fields:
-        """What has the value: the file, else its first frame."""
+        """Returns the entries with this value: the file's or its first frame's."""
         is_shared = data.data.get(name) is not None or not frames
         return data if is_shared else frames[0]
 

@@ -13,12 +13,12 @@ from bodyslam_jax.io.camera.tum import read_tum
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.types import CameraPath, PathClock
 
-_FEWEST = 2
-"""Frames with a pose, at least."""
+_MIN_POSES = 2
+"""Least number of frames with a pose."""
 MAX_GAP_S = 0.5
-"""Time between poses across which frames are interpolated, s."""
-_SAME_TIME = 0.05
-"""Of a frame, by which the times of a pose and of its frame may differ: those of some
+"""Longest time between poses across which frames are interpolated, s."""
+_TIME_TOLERANCE_FRAMES = 0.05
+"""Largest difference of the times of a pose and of its frame, in frames: times of some
 files are whole milliseconds."""
 _UNITS = (
     ("seconds", 1.0),
@@ -27,17 +27,17 @@ _UNITS = (
     ("nanoseconds", 1e-9),
 )
 """Units of timestamps, and how many seconds each is."""
-_SHORTEST_STEP, _LONGEST_STEP = 1e-3, 2.0
-"""s, between poses: trackers give at most 1000 poses a second, and keyframes at least
-every other second."""
-_UNIX_TIME = 1e8
-"""s: times beyond it count from 1970."""
-_NUMBER_STEPS = 1, 100
-"""Steps of whole numbers that may be those of frames."""
-_LARGEST_STEP = 4
+_MIN_STEP_S, _MAX_STEP_S = 1e-3, 2.0
+"""Range of times between poses, s: trackers give at most 1000 poses a second, and
+keyframes at least every other second."""
+_MIN_UNIX_TIME_S = 1e8
+"""Time, s, beyond which times count from 1970."""
+_FRAME_NUMBER_STEPS = 1, 100
+"""Range of the steps of whole numbers that may be those of frames."""
+_MIN_MILLISECOND_STEP = 4
 """Step from which whole numbers that span more than the video are milliseconds: 4 ms
 are 250 poses a second."""
-_EVERY = (1, 2, 3, 4, 5, 6, 8, 10, 15)
+_FRAME_STRIDES = (1, 2, 3, 4, 5, 6, 8, 10, 15)
 """Values of k for a pose of every k-th frame."""
 
 
@@ -100,8 +100,8 @@ def read_camera_path(
     else:
         times, poses = read_tum(path)
         of_frames = False
-    if len(times) < _FEWEST:
-        raise InputError(f"{path}: one pose, expected {_FEWEST} or more.")
+    if len(times) < _MIN_POSES:
+        raise InputError(f"{path}: one pose, expected {_MIN_POSES} or more.")
     clocks = _clocks(times, timestamps, of_frames)
     if of_frames:
         T_WC = np.tile(np.eye(4), (len(timestamps), 1, 1))
@@ -109,10 +109,10 @@ def read_camera_path(
         T_WC[known] = poses
     else:
         T_WC, known = at_times(clocks[0].times, poses, timestamps)
-    if clocks[0].is_videos and known.sum() < _FEWEST:
+    if clocks[0].is_videos and known.sum() < _MIN_POSES:
         raise InputError(
             f"{path}: poses for {known.sum()} of the video's {len(timestamps)} frames, "
-            f"expected {_FEWEST} or more: of another video, or another clock?"
+            f"expected {_MIN_POSES} or more: of another video, or another clock?"
         )
     if clocks[0].is_videos and not known.all():
         warn(f"{path.name}: poses for {known.sum()} of {len(timestamps)} frames.")
@@ -124,7 +124,7 @@ def _clocks(
     timestamps: Float[np.ndarray, " t"],
     of_frames: bool,
 ) -> tuple[PathClock, ...]:
-    """Readings of a path's times, the likeliest first.
+    """Returns the possible readings of a path's times, the likeliest first.
 
     Args:
         timestamps: of the video's frames, s.
@@ -143,10 +143,10 @@ def _clocks(
     from_zero = abs(times[0]) < 1e-6 and times[-1] < end - 1.5 * period
     if count == num_frames:
         found.append(PathClock("a pose for each frame", timestamps.copy(), True))
-    elif within and step < _LONGEST_STEP and not from_zero:
+    elif within and step < _MAX_STEP_S and not from_zero:
         found.append(PathClock("times in seconds", times, True))
     whole = bool((times == np.round(times)).all())
-    if whole and _NUMBER_STEPS[0] <= step <= _NUMBER_STEPS[1]:
+    if whole and _FRAME_NUMBER_STEPS[0] <= step <= _FRAME_NUMBER_STEPS[1]:
         numbered = (times - times[0]) * period
         if times[-1] < num_frames:
             at = np.interp(times, np.arange(num_frames), timestamps)
@@ -155,21 +155,21 @@ def _clocks(
                 found.append(PathClock(f"{name} from 0", at, False))
             else:
                 found.append(PathClock(name, at, True))
-        elif step < _LARGEST_STEP or times[-1] - times[0] < 1.1 * num_frames:
+        elif step < _MIN_MILLISECOND_STEP or times[-1] - times[0] < 1.1 * num_frames:
             name = "frame numbers of another count"
             found.append(PathClock(name, numbered + timestamps[0], False))
-    overlapping = step < _LONGEST_STEP and times[0] < end and times[-1] > timestamps[0]
+    overlapping = step < _MAX_STEP_S and times[0] < end and times[-1] > timestamps[0]
     if overlapping and not from_zero and not (whole and step >= 1):
         found.append(PathClock("times in seconds", times, True))
     for name, unit in _UNITS:
-        if _SHORTEST_STEP <= step * unit < _LONGEST_STEP:
-            unix = times[0] * unit > _UNIX_TIME
+        if _MIN_STEP_S <= step * unit < _MAX_STEP_S:
+            unix = times[0] * unit > _MIN_UNIX_TIME_S
             what = f"Unix time in {name}" if unix else f"times in {name}"
             what += " from 0" if times[0] == 0 else " on a clock of their own"
             scaled = starts[0] + (starts - starts[0]) * unit
             found.append(PathClock(what, scaled, False))
     # Of a clock that assumed another frame rate: a pose for every k-th frame.
-    for k in _EVERY:
+    for k in _FRAME_STRIDES:
         if step > 0 and (times[-1] - times[0]) / step * k <= 1.1 * num_frames:
             scaled = starts[0] + (times - times[0]) / step * k * period
             what = f"a pose every {k} frames" if k > 1 else "a pose for each frame"
@@ -184,8 +184,8 @@ def at_times(
     poses: Float[np.ndarray, "n 4 4"],
     timestamps: Float[np.ndarray, " t"],
 ) -> tuple[Float[np.ndarray, "t 4 4"], Bool[np.ndarray, " t"]]:
-    """Poses (camera to world) at the frames' `timestamps`, interpolated between those
-    at `times` (s, increasing), and the frames that have one.
+    """Returns poses (camera to world) at the frames' `timestamps`, interpolated between
+    those at `times` (s, increasing), and the frames that have one.
 
     A frame has none before the first pose, after the last, and where neighbouring poses
     lie further apart than `MAX_GAP_S`, unless it is at one of them.
@@ -196,7 +196,7 @@ def at_times(
     near = np.minimum(
         np.abs(timestamps - times[after - 1]), np.abs(timestamps - times[after])
     )
-    same = _SAME_TIME * usual_step(timestamps)
+    same = _TIME_TOLERANCE_FRAMES * usual_step(timestamps)
     inside = (timestamps >= times[0] - same) & (timestamps <= times[-1] + same)
     known = inside & ((gap <= MAX_GAP_S) | (near <= same))
     if not known.any():
@@ -209,7 +209,8 @@ def at_times(
 
 
 def usual_step(times: Float[np.ndarray, " n"]) -> float:
-    """The step of increasing times without their gaps, in their unit; 0 of one time.
+    """Returns the step of increasing times without their gaps, in their unit; 0 for one
+    time.
 
     It is the mean of the steps up to 1.5 times the median, because times may be
     rounded.

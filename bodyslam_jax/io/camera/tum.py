@@ -13,10 +13,11 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.declared import MAX_MAGNITUDE
 from bodyslam_jax.io.files import read_lines
 
-_LONGEST = 1000
-"""Characters of a line that are read: eight numbers have some two hundred."""
+_MAX_LINE_CHARACTERS = 1000
+"""Number of characters of a line that are read: eight numbers have some two hundred."""
 _MAX_NUMBER = 1e19
-"""A time in nanoseconds since 1970 has 19 digits; positions are far smaller."""
+"""Largest number: a time in nanoseconds since 1970 has 19 digits; positions are far
+smaller."""
 
 
 def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 4 4"]]:
@@ -28,7 +29,7 @@ def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 
     lines = read_lines(path, "a TUM trajectory")
     for number, line in enumerate(lines, 1):
         # No more than is needed to see that a line is too long.
-        words = line[:_LONGEST].partition("#")[0].replace(",", " ").split()
+        words = line[:_MAX_LINE_CHARACTERS].partition("#")[0].replace(",", " ").split()
         if not words:
             continue
         try:

@@ -17,21 +17,22 @@ from bodyslam_jax.io.keypoints.layouts import LAYOUTS, VITPOSE, from_layout
 from bodyslam_jax.io.keypoints.lying import lying
 from bodyslam_jax.io.keypoints.names import layout_of
 
-_MAX_LOST = 0.5
-"""A file is refused if at least this share of its detections is not usable."""
-_USABLE = 4
+_MAX_LOST_SHARE = 0.5
+"""Share of detections that are not usable from which a file is refused."""
+_MIN_VALID_POINTS = 4
 """Least number of valid points of a usable detection."""
-_ALL_LIE = 0.85
-"""If at least this share of the detections lies sideways, the reason is the image axes,
+_MIN_LYING_SHARE = 0.85
+"""Share of the detections that lie sideways from which the reason is the image axes,
 not posture."""
-_MIN_MIRRORED = 0.7
-"""x and y are exchanged where at least this share of the detections is mirrored."""
+_MIN_MIRRORED_SHARE = 0.7
+"""Least share of mirrored detections with which x and y are exchanged."""
 _MIN_DETECTIONS = 10
 """Least number of detections for a decision about x and y."""
 
 
 def arranged(path: Path, listed: Listed, warn: Warn) -> list[Float[np.ndarray, "25 3"]]:
-    """The keypoints of each row of a file in BODY_25 order: u px, v px, confidence.
+    """Returns the keypoints of each row of a file in BODY_25 order: u px, v px,
+    confidence.
 
     The file's layout follows from its names of keypoints. Without names it is the usual
     layout of that number of keypoints, unless the distances between them clearly favour
@@ -63,7 +64,8 @@ def arranged(path: Path, listed: Listed, warn: Warn) -> list[Float[np.ndarray, "
 
 
 def _whole(path: Path, raw: list[np.ndarray], warn: Warn) -> list[np.ndarray]:
-    """The keypoints, with non-finite ones replaced by keypoints of confidence 0."""
+    """Returns the keypoints, with non-finite ones replaced by keypoints of confidence
+    0."""
     broken, total, lost = 0, 0, 0
     whole = []
     for points in raw:
@@ -71,12 +73,15 @@ def _whole(path: Path, raw: list[np.ndarray], warn: Warn) -> list[np.ndarray]:
         # A missing point (confidence 0) may have no coordinates.
         bad = ~finite & ~(points[:, 2] <= 0)
         broken, total = broken + int(bad.sum()), total + len(points)
-        lost += bool(bad.any()) and int((finite & (points[:, 2] > 0)).sum()) < _USABLE
+        lost += (
+            bool(bad.any())
+            and int((finite & (points[:, 2] > 0)).sum()) < _MIN_VALID_POINTS
+        )
         whole.append(np.where(finite[:, None], points, 0.0))
-    if lost > _MAX_LOST * len(raw):
+    if lost > _MAX_LOST_SHARE * len(raw):
         raise InputError(
             f"{path}: {broken} of {total} keypoints with NaN or infinity, so that "
-            f"{lost} of {len(raw)} people have fewer than {_USABLE} left."
+            f"{lost} of {len(raw)} people have fewer than {_MIN_VALID_POINTS} left."
         )
     if broken:
         warn(
@@ -93,7 +98,7 @@ def _in_order(
     listed: Listed,
     warn: Warn,
 ) -> tuple[np.ndarray, list[int]]:
-    """The keypoints in BODY_25 order, and the layout of the file."""
+    """Returns the keypoints in BODY_25 order, and the layout of the file."""
     num = points.shape[1]
     if layout is not None and listed.parts is not None:
         if len(layout) != num:
@@ -134,18 +139,19 @@ def _in_order(
 def _right_way_round(
     points: np.ndarray, has_face: bool, from_rows: bool, warn: Warn
 ) -> np.ndarray:
-    """The keypoints, with x and y exchanged if people lie sideways because the file has
-    (y, x); unchanged, with a warning, if a rotation of the image explains it as well.
+    """Returns the keypoints, with x and y exchanged if people lie sideways because the
+    file has (y, x); unchanged, with a warning, if a rotation of the image explains it
+    as well.
 
     Args:
         has_face: whether the layout has nose and eyes.
         from_rows: whether the layout is that of a tool that writes (y, x).
     """
     found = lying(points, has_face)
-    if len(points) < _MIN_DETECTIONS or found.share < _ALL_LIE:
+    if len(points) < _MIN_DETECTIONS or found.share < _MIN_LYING_SHARE:
         return points
     share = f"people lie on their side, head to the left, {100 * found.share:.0f} %"
-    if from_rows or found.mirrored >= _MIN_MIRRORED:
+    if from_rows or found.mirrored >= _MIN_MIRRORED_SHARE:
         why = "and easy_ViTPose, whose order this is, writes (y, x)"
         if not from_rows:
             why = "and their faces and feet are those of a mirror image"

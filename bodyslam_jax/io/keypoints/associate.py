@@ -1,4 +1,4 @@
-"""Unordered detections in each frame -> people tracked through the video.
+"""Associates unordered detections in each frame to people tracked through the video.
 
 Hungarian assignment, with costs from keypoint distances (relative to the person's size)
 and box overlap, to positions predicted at constant velocity.
@@ -15,19 +15,20 @@ from bodyslam_jax.io.keypoints.doubles import doubles, is_stray
 from bodyslam_jax.io.keypoints.reader import Detections
 from bodyslam_jax.types import Keypoints
 
-_FEWEST, _MANY = 3, 8
-"""Common keypoints from which sizes are compared, and from which they are reliable."""
-_GROWTH_OF_FEW, _GROWTH = 2.5, 1.7
-"""Ratio of sizes, by few and by many keypoints, from which it is another person."""
-_PRESENT = 0.05
-"""Confidence from which a keypoint counts as detected."""
+_MIN_SIZE_POINTS, _MIN_RELIABLE_SIZE_POINTS = 3, 8
+"""Number of common keypoints from which sizes are compared, and from which they are
+reliable."""
+_MAX_GROWTH_FEW_POINTS, _MAX_GROWTH = 2.5, 1.7
+"""Largest ratio of sizes of one person, by few and by many common keypoints."""
+_MIN_CONFIDENCE = 0.05
+"""Least confidence of a detected keypoint."""
 
 
 @dataclasses.dataclass
 class _Person:
     number: int
     frame: int
-    """The last one in which they were detected."""
+    """The last frame in which the person was detected."""
     points: np.ndarray
     """(25, 3): u px, v px, confidence; hidden keypoints are moved along with the
     others."""
@@ -37,7 +38,8 @@ class _Person:
     """(25,): frames since each keypoint was last detected."""
 
     def predict(self, frame: int) -> np.ndarray:
-        """Keypoints (25, 3) predicted for `frame`; at most five frames of motion."""
+        """Returns keypoints (25, 3) predicted for `frame`, over at most five frames of
+        motion."""
         gap = min(frame - self.frame, 5)
         last = self.points.copy()
         last[:, :2] += gap * self.velocity
@@ -45,15 +47,17 @@ class _Person:
 
     def extend(self, frame: int, points: np.ndarray, max_gap: int) -> None:
         gap = frame - self.frame
-        present = points[:, 2] > _PRESENT
-        both = present & (self.points[:, 2] > _PRESENT)
+        present = points[:, 2] > _MIN_CONFIDENCE
+        both = present & (self.points[:, 2] > _MIN_CONFIDENCE)
         moved = self.velocity
-        if both.sum() >= _FEWEST:
+        if both.sum() >= _MIN_SIZE_POINTS:
             moved = np.median((points - self.points)[both, :2], axis=0) / gap
             self.velocity = 0.7 * self.velocity + 0.3 * moved
         # Hidden keypoints are kept, so that a half hidden person keeps their size.
         self.hidden = np.where(present, 0, self.hidden + gap)
-        kept = ~present & (self.points[:, 2] > _PRESENT) & (self.hidden <= max_gap)
+        kept = (
+            ~present & (self.points[:, 2] > _MIN_CONFIDENCE) & (self.hidden <= max_gap)
+        )
         points = points.copy()
         points[kept] = self.points[kept]
         points[kept, :2] += gap * moved
@@ -68,7 +72,7 @@ class _Track:
     points: list[np.ndarray]
 
     def presence(self) -> float:
-        """Sum over frames of confidence times size; it ranks people."""
+        """Returns the sum over frames of confidence times size; it ranks people."""
         return sum(float(p[:, 2].sum()) * _size(p) for p in self.points)
 
 
@@ -78,8 +82,8 @@ def associate(
     fps: float,
     given: list[np.ndarray] | None = None,
 ) -> tuple[Keypoints, tuple[str, ...]]:
-    """People in the detections of `t` frames, in the order of their presence, and
-    warnings.
+    """Returns the people in the detections of `t` frames, in the order of their
+    presence, and warnings.
 
     Two at one place at one time are one person. People detected for less than
     `config.min_duration` are dropped, unless everybody is; and so are those with the
@@ -99,7 +103,9 @@ def associate(
     others = [dict(zip(p.frames, p.points, strict=True)) for p in kept]
     gap = max(1, round(config.max_gap * fps))
     brief = sum(
-        not is_stray(dict(zip(p.frames, p.points, strict=True)), others, gap, _PRESENT)
+        not is_stray(
+            dict(zip(p.frames, p.points, strict=True)), others, gap, _MIN_CONFIDENCE
+        )
         for p in people
         if not any(p is k for k in kept)
     )
@@ -129,8 +135,8 @@ def associate(
 
 
 def identify(detections: Detections, max_gap: int) -> list[np.ndarray]:
-    """For each frame the number of the person that each of its `n` detections is of,
-    (n,), from 0.
+    """Returns for each frame the number of the person that each of its `n` detections
+    is of, (n,), from 0.
 
     Args:
         max_gap: frames without a detection after which a person is not recognised.
@@ -166,13 +172,14 @@ def _collect(detections: Detections, found: list[np.ndarray]) -> list[_Track]:
 
 
 def _once(people: list[_Track], least: int) -> tuple[list[_Track], list[int]]:
-    """Everybody once, and by how many more tracks of `least` frames people were
-    followed who were followed more than once. The surer track's detection is kept."""
+    """Returns every person once, and for each person with several tracks of `least`
+    frames or more the number of additional tracks. Detections of the track with the
+    higher presence are kept."""
     order = sorted(range(len(people)), key=lambda i: -people[i].presence())
     tracks = [dict(zip(p.frames, p.points, strict=True)) for p in people]
     found = {
         order[i]: order[j]
-        for i, j in doubles([tracks[i] for i in order], _PRESENT).items()
+        for i, j in doubles([tracks[i] for i in order], _MIN_CONFIDENCE).items()
     }
     for double, person in found.items():
         for frame, points in tracks[double].items():
@@ -188,7 +195,8 @@ def _once(people: list[_Track], least: int) -> tuple[list[_Track], list[int]]:
 
 
 def _returns(people: list[_Track]) -> list[str]:
-    """Warnings about people who appear after another has left: both may be one."""
+    """Returns warnings about people who appear after another has left: both may be one
+    person."""
     warnings = []
     for j, person in enumerate(people):
         begin = person.frames[0]
@@ -203,16 +211,17 @@ def _returns(people: list[_Track]) -> list[str]:
 
 
 def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
-    """0 for a detection at the predicted place; from 1 it is another person."""
+    """Returns the cost of assigning a detection to a person: 0 at the predicted
+    position; from 1 on it is another person."""
     expected = person.predict(frame)
-    both = (points[:, 2] > _PRESENT) & (expected[:, 2] > _PRESENT)
+    both = (points[:, 2] > _MIN_CONFIDENCE) & (expected[:, 2] > _MIN_CONFIDENCE)
     if not both.any():
         return np.inf
     size = max(_size(points), _size(expected), 1.0)
     # The median tolerates a swapped or lost limb. A detection whose left and right are
     # exchanged altogether is of the same person, too.
     other = points[list(BODY25_MIRRORED)]
-    crossed = (other[:, 2] > _PRESENT) & (expected[:, 2] > _PRESENT)
+    crossed = (other[:, 2] > _MIN_CONFIDENCE) & (expected[:, 2] > _MIN_CONFIDENCE)
     away = lambda p, both: np.median(np.linalg.norm((p - expected)[both, :2], axis=-1))
     distance = away(points, both)
     if crossed.any():
@@ -226,30 +235,34 @@ def _cost(person: _Person, frame: int, points: np.ndarray) -> float:
 
 
 def _as_large(points: np.ndarray, expected: np.ndarray) -> bool:
-    """Whether the sizes, by common keypoints, can be those of one person."""
-    both = (points[:, 2] > _PRESENT) & (expected[:, 2] > _PRESENT)
-    if both.sum() < _FEWEST:
+    """Returns True if the sizes, by common keypoints, can be those of one person."""
+    both = (points[:, 2] > _MIN_CONFIDENCE) & (expected[:, 2] > _MIN_CONFIDENCE)
+    if both.sum() < _MIN_SIZE_POINTS:
         return True
-    most = _GROWTH if both.sum() >= _MANY else _GROWTH_OF_FEW
+    most = (
+        _MAX_GROWTH
+        if both.sum() >= _MIN_RELIABLE_SIZE_POINTS
+        else _MAX_GROWTH_FEW_POINTS
+    )
     growth = _size(points[both]) / max(_size(expected[both]), 1.0)
     return 1 / most < growth < most
 
 
 def _box(points: np.ndarray) -> np.ndarray:
-    uv = points[points[:, 2] > _PRESENT][:, :2]
+    uv = points[points[:, 2] > _MIN_CONFIDENCE][:, :2]
     if not len(uv):
         return np.zeros((2, 2))
     return np.stack([uv.min(axis=0), uv.max(axis=0)])
 
 
 def _size(points: np.ndarray) -> float:
-    """Longer side of the box around a person, px."""
+    """Returns the longer side of the box around a person, px."""
     box = _box(points)
     return float((box[1] - box[0]).max())
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> float:
-    """Intersection over union of the boxes around two people."""
+    """Returns the intersection over union of the boxes around two people."""
     p, q = _box(a), _box(b)
     shared = np.clip(np.minimum(p[1], q[1]) - np.maximum(p[0], q[0]), 0, None).prod()
     union = (p[1] - p[0]).prod() + (q[1] - q[0]).prod() - shared

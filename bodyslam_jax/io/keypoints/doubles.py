@@ -1,4 +1,4 @@
-"""Tracks that are of one person: followed twice, or stray points of somebody there."""
+"""Duplicate tracks of one person, and tracks of stray points of another person."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,23 +7,25 @@ import numpy as np
 Track = Mapping[int, np.ndarray]
 """Keypoints (k, 3) of a person by frame: u px, v px, confidence."""
 
-_TWICE = 0.15
-"""Distance of two sets of keypoints (median), of the person's size, below which they
-are of one person: of people side by side it is a third, as wide as they are."""
-_MOST = 0.8
-"""Share of the frames that two tracks have in common in which that must be so."""
-_FEWEST_FRAMES, _SHARED = 3, 0.15
-"""Frames, and their share of the shorter track, from which tracks are compared."""
-_FEWEST_POINTS = 5
-_INSIDE = 0.5
-"""Share of stray points that are in the box of the person whose they are."""
-_ROOM = 0.15
-"""What is added to that box on all sides, of its larger side."""
+_MAX_DISTANCE = 0.15
+"""Largest median distance of two sets of keypoints of one person, relative to the
+person's size: of people side by side it is a third, as wide as they are."""
+_MIN_CLOSE_SHARE = 0.8
+"""Least share of the common frames of two tracks of one person in which their distance
+is below that."""
+_MIN_COMMON_FRAMES, _MIN_COMMON_SHARE = 3, 0.15
+"""Least number of common frames of tracks that are compared, and least share of the
+shorter track."""
+_MIN_POINTS = 5
+_MIN_INSIDE_SHARE = 0.5
+"""Share of stray points that are in the box of the person to whom they belong."""
+_BOX_MARGIN = 0.15
+"""Margin of that box on all sides, relative to its longer side."""
 
 
 def doubles(people: Sequence[Track], least: float) -> dict[int, int]:
-    """Those of `people` who are at one place at one time with an earlier one of the
-    list, and who that is.
+    """Returns, for those of `people` who are at the position of an earlier one in the
+    list at the same time, the index of that one.
 
     Args:
         least: confidence from which a keypoint counts.
@@ -38,27 +40,27 @@ def doubles(people: Sequence[Track], least: float) -> dict[int, int]:
 
 
 def is_stray(track: Track, people: Sequence[Track], gap: int, least: float) -> bool:
-    """Whether most of a track lies where somebody else of `people` is, `gap` frames
-    before or after at most."""
+    """Returns True if most of a track lies in the box of another one of `people`, at
+    most `gap` frames before or after."""
     within = [
         any(_inside(points, person, frame, gap, least) for person in people)
         for frame, points in track.items()
     ]
-    return bool(np.mean(within) > _INSIDE)
+    return bool(np.mean(within) > _MIN_INSIDE_SHARE)
 
 
 def _one_place(a: Track, b: Track, least: float) -> bool:
     shared = sorted(a.keys() & b.keys())
-    fewest = max(_FEWEST_FRAMES, _SHARED * min(len(a), len(b)))
+    fewest = max(_MIN_COMMON_FRAMES, _MIN_COMMON_SHARE * min(len(a), len(b)))
     if len(shared) < fewest:
         return False
-    near = [_apart(a[k], b[k], least) < _TWICE for k in shared]
-    return bool(np.mean(near) >= _MOST)
+    near = [_apart(a[k], b[k], least) < _MAX_DISTANCE for k in shared]
+    return bool(np.mean(near) >= _MIN_CLOSE_SHARE)
 
 
 def _apart(a: np.ndarray, b: np.ndarray, least: float) -> float:
     both = (a[:, 2] > least) & (b[:, 2] > least)
-    if both.sum() < _FEWEST_POINTS:
+    if both.sum() < _MIN_POINTS:
         return np.inf
     size = max(float(np.ptp(p[p[:, 2] > least, :2], axis=0).max()) for p in (a, b))
     away = np.linalg.norm((a - b)[both, :2], axis=1)
@@ -68,17 +70,17 @@ def _apart(a: np.ndarray, b: np.ndarray, least: float) -> float:
 def _inside(
     points: np.ndarray, person: Track, frame: int, gap: int, least: float
 ) -> bool:
-    """Whether most of the points are in a person's box in the nearest frame."""
+    """Returns True if most of the points are in a person's box in the nearest frame."""
     nearest = min(person, key=lambda k: abs(k - frame))
     if abs(nearest - frame) > gap:
         return False
     low, high = _box(person[nearest], least)
     if not np.isfinite(low).all():
         return False
-    room = _ROOM * float((high - low).max())
+    room = _BOX_MARGIN * float((high - low).max())
     uv = points[points[:, 2] > least, :2]
     inside = ((uv >= low - room) & (uv <= high + room)).all(axis=1)
-    return bool(len(uv)) and bool(inside.mean() > _INSIDE)
+    return bool(len(uv)) and bool(inside.mean() > _MIN_INSIDE_SHARE)
 
 
 def _box(points: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:

@@ -22,7 +22,7 @@ from bodyslam_jax.io.keypoints.names import names_in
 GROUP = "bodyslam_jax.keypoint_formats"
 """Entry points of this group are formats of other packages."""
 _MAX_PERSON = 10**15
-"""A larger one is no number of a person."""
+"""Largest number of a person."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,13 +35,14 @@ class Listed:
     names: list[str]
     """All images that are listed, with people or without."""
     complete: bool = True
-    """Whether images without people are listed, too."""
+    """True if images without people are listed, too."""
     parts: tuple[str, ...] | None = None
     """Names of the `j` points, if the file has them."""
     row_first: bool = False
-    """Whether the tool writes (y, x)."""
+    """True if the tool writes (y, x)."""
     size: Size | None = None
-    """Of the images that the points are in, px, if the file declares it."""
+    """Width and height of the images that the points are in, px, if the file declares
+    it."""
     detector: str | None = None
     """The detector's name, if the file has it."""
 
@@ -59,7 +60,7 @@ class KeypointFormat(Format):
 
     @abc.abstractmethod
     def read(self, source: Source, num_frames: int | None) -> Listed:
-        """The content of a file that `recognises` accepts.
+        """Returns the content of a file that `recognises` accepts.
 
         Args:
             num_frames: of the video; `None` for as many as the file has.
@@ -70,24 +71,24 @@ class KeypointFormat(Format):
 
 
 def keypoint_formats() -> list[KeypointFormat]:
-    """All keypoint formats, of this package and of others."""
+    """Returns all keypoint formats, of this package and of others."""
     package = "bodyslam_jax.io.keypoints.formats"
     # The class is abstract, which a type of classes may not be for the checker.
     return formats(KeypointFormat, package, GROUP)  # pyright: ignore
 
 
 def parsed(path: Path) -> Any:
-    """The content of a file of a general kind: `.npz`, or else JSON."""
+    """Returns the content of a file of a general kind: `.npz`, or else JSON."""
     return read_npz(path) if path.suffix.lower() == ".npz" else read_json(path)
 
 
 def has(data: Any, *keys: str) -> bool:
-    """Whether the data is a dictionary with the keys."""
+    """Returns True if the data is a dictionary with the keys."""
     return isinstance(data, dict) and set(keys) <= set(data)
 
 
 def points_of(path: Path, values: Any) -> np.ndarray:
-    """Numbers of keypoints; NaN for those that are missing.
+    """Returns numbers of keypoints; NaN for those that are missing.
 
     **Raises:** `InputError`, naming the file, if they are no numbers.
     """
@@ -97,7 +98,7 @@ def points_of(path: Path, values: Any) -> np.ndarray:
 
 
 def triples(path: Path, flat: Any) -> np.ndarray:
-    """Keypoints (j, 3: u, v, score) of a table or of one list of 3j numbers.
+    """Returns keypoints (j, 3: u, v, score) of a table or of one list of 3j numbers.
 
     **Raises:** `InputError`, naming the file, if they are something else.
     """
@@ -110,7 +111,8 @@ def triples(path: Path, flat: Any) -> np.ndarray:
 
 
 def person_in(entry: dict, *keys: str) -> int:
-    """The number of a tracked person, alone or in a list; -1 if there is none."""
+    """Returns the number of a tracked person, alone or in a list; -1 if there is
+    none."""
     value = next((entry[k] for k in keys if k in entry), None)
     while isinstance(value, list):
         value = value[0] if value else None
@@ -124,13 +126,13 @@ def person_in(entry: dict, *keys: str) -> int:
 
 
 def part_names(data: Any) -> tuple[str, ...] | None:
-    """The names of the points in a file's header, in order."""
+    """Returns the names of the points in a file's header, in order."""
     found = names_in(data)
     return None if found is None else tuple(found)
 
 
 def detector_in(data: Any) -> str | None:
-    """The detector's name in a file's header."""
+    """Returns the detector's name in a file's header."""
     if not isinstance(data, dict):
         return None
     for key in ("meta_info", "dataset_meta", "metadata", "meta", "info"):

@@ -16,29 +16,30 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax.io.keypoints.layouts import HEAD_TOP, NUM_PARTS, SPINE
 
-_PRESENT = 0.05
-_SURE = 0.3
-_FEWEST_POINTS = 6
+_MIN_PRESENT_CONFIDENCE = 0.05
+_MIN_CONFIDENCE = 0.3
+_MIN_POINTS = 6
 """Least number of keypoints of a detection that is evaluated."""
-_FEWEST_PEOPLE = 5
-_MANY_POINTS = 12
-"""Detections with at least so many keypoints fit their layout well: they are not of a
+_MIN_DETECTIONS = 5
+_MIN_WHOLE_BODY_POINTS = 12
+"""Number of keypoints from which detections fit their layout well: they are not of a
 half hidden body."""
-_PLAUSIBLE = 1.1
+_MIN_LOG_LIKELIHOOD = 1.1
 """Least log-likelihood of a layout that is chosen, nats per keypoint."""
-_MARGIN = 0.3
-"""By how much a layout other than the usual one must be better, nats per keypoint."""
-_AGREED = 0.8
+_MIN_LOG_LIKELIHOOD_GAIN = 0.3
+"""Least gain in log-likelihood of a layout other than the usual one, nats per
+keypoint."""
+_MIN_AGREEMENT = 0.8
 """Least share of the detections for which it must be better."""
-_IMPLAUSIBLE, _POOR = 0.1, 0.7
+_IMPLAUSIBLE_LOG_LIKELIHOOD, _POOR_LOG_LIKELIHOOD = 0.1, 0.7
 """Log-likelihoods (nats per keypoint) below which keypoints are not those of a body in
 the usual layout (random points have up to 0.4), and below which they fit it poorly."""
-_ALIVE = 0.02
+_MIN_POSTURE_CHANGE = 0.02
 """Least change of posture of a moving person, relative to the person's size."""
-_SCALES = (0.15, 0.25, 0.35, 0.5, 0.7)
+_RMS_DISTANCES_M = (0.15, 0.25, 0.35, 0.5, 0.7)
 """Candidates for the RMS distance of the detected points from their mean, m; a half
 hidden body has less."""
-_BREADTH = 0.6
+_BACKGROUND_WIDTH_M = 0.6
 """Width of the density of points without neighbours, m."""
 
 _BONES = (  # parts of the right side, of the left side, m
@@ -60,7 +61,7 @@ _BONES = (  # parts of the right side, of the left side, m
     ((24, 22), (21, 19), 0.22),
     ((24, 23), (21, 20), 0.20),
 )
-_BETWEEN = (
+_OTHER_NEIGHBOURS = (
     ((2, 5), 0.33),
     ((9, 12), 0.20),
     ((15, 16), 0.06),
@@ -72,7 +73,7 @@ _BETWEEN = (
     ((SPINE, 8), 0.20),
     ((SPINE, 1), 0.30),
 )
-_NEIGHBOURS = [(a, m) for r, l, m in _BONES for a in (r, l)] + list(_BETWEEN)
+_NEIGHBOURS = [(a, m) for r, l, m in _BONES for a in (r, l)] + list(_OTHER_NEIGHBOURS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,11 +82,11 @@ class Choice:
 
     layout: str
     changed: bool
-    """Whether it is not the usual layout of that number of keypoints."""
+    """True if it is not the usual layout of that number of keypoints."""
     plausible: bool
-    """Whether the keypoints are those of a body in any of the layouts."""
+    """True if the keypoints are those of a body in any of the layouts."""
     poor_fit: bool
-    """Whether the keypoints are plausible, but fit the layout poorly."""
+    """True if the keypoints are plausible, but fit the layout poorly."""
     nats: dict[str, float]
     """Log-likelihood of each layout, nats per point."""
 
@@ -93,14 +94,15 @@ class Choice:
 def choose_layout(
     points: Float[np.ndarray, "n j 3"], layouts: Mapping[str, list[int]]
 ) -> Choice:
-    """The layout of `n` detections among `layouts`, the first being the usual one.
+    """Returns the layout of `n` detections among `layouts`, the first being the usual
+    one.
 
     Another is chosen only if it is plausible, much better, better for nearly all
     detections, and postures change.
     """
     first = next(iter(layouts))
-    present = points[..., 2] > _PRESENT
-    enough = present.sum(axis=1) >= _FEWEST_POINTS
+    present = points[..., 2] > _MIN_PRESENT_CONFIDENCE
+    enough = present.sum(axis=1) >= _MIN_POINTS
     points, present = points[enough], present[enough]
     if not len(points):
         return Choice(first, False, True, False, {})
@@ -110,16 +112,20 @@ def choose_layout(
     better = nats[best] > nats[first]
     if (
         best != first
-        and mean[best] >= _PLAUSIBLE
-        and mean[best] - mean[first] >= _MARGIN
-        and better.mean() >= _AGREED
+        and mean[best] >= _MIN_LOG_LIKELIHOOD
+        and mean[best] - mean[first] >= _MIN_LOG_LIKELIHOOD_GAIN
+        and better.mean() >= _MIN_AGREEMENT
         and _changes(points, present)
     ):
         return Choice(best, True, True, False, mean)
-    many = present.sum(axis=1) >= _MANY_POINTS
-    least = float(nats[first][many].mean()) if many.sum() >= _FEWEST_PEOPLE else np.inf
-    poor = least < _POOR and _changes(points[many], present[many])
-    implausible = poor and least < _IMPLAUSIBLE and max(mean.values()) < _PLAUSIBLE
+    many = present.sum(axis=1) >= _MIN_WHOLE_BODY_POINTS
+    least = float(nats[first][many].mean()) if many.sum() >= _MIN_DETECTIONS else np.inf
+    poor = least < _POOR_LOG_LIKELIHOOD and _changes(points[many], present[many])
+    implausible = (
+        poor
+        and least < _IMPLAUSIBLE_LOG_LIKELIHOOD
+        and max(mean.values()) < _MIN_LOG_LIKELIHOOD
+    )
     return Choice(first, False, not implausible, poor and not implausible, mean)
 
 
@@ -128,8 +134,8 @@ def likelihood(
     present: Bool[np.ndarray, "n j"],
     layout: list[int],
 ) -> Float[np.ndarray, " n"]:
-    """Log-likelihood of each of `n` detections under a layout, nats per detected point,
-    in units in which the RMS distance from the mean is 0.5."""
+    """Returns the log-likelihood of each of `n` detections under a layout, nats per
+    detected point, in units in which the RMS distance from the mean is 0.5."""
     uv = _normalised(points, present)
     num = len(points)
     position, has_part = (
@@ -144,7 +150,7 @@ def likelihood(
         for (a, b), length in _NEIGHBOURS
     ]
     found = np.full(num, -np.inf)
-    for size in _SCALES:
+    for size in _RMS_DISTANCES_M:
         total, count = np.zeros((num, NUM_PARTS)), np.zeros((num, NUM_PARTS))
         for a, b, length, square in pairs:
             both = has_part[:, a] & has_part[:, b]
@@ -152,7 +158,7 @@ def likelihood(
             for part in (a, b):
                 total[:, part] += value
                 count[:, part] += both
-        alone = _density((uv**2).sum(axis=-1) * size**2, _BREADTH)
+        alone = _density((uv**2).sum(axis=-1) * size**2, _BACKGROUND_WIDTH_M)
         sums = np.zeros(num)
         for k, part in enumerate(layout):
             if part >= 0:
@@ -167,13 +173,14 @@ def likelihood(
 
 
 def _density(square: np.ndarray, width: float) -> np.ndarray:
-    """Log density, up to 1/2π, of Student's t with two degrees of freedom in the
-    plane."""
+    """Returns the log density, up to 1/2π, of Student's t with two degrees of freedom
+    in the plane."""
     return -2 * np.log(width) - 2 * np.log1p(square / (2 * width**2))
 
 
 def _normalised(points: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Positions relative to the mean of the detected points, scaled to an RMS of 1."""
+    """Returns positions relative to the mean of the detected points, scaled to an RMS
+    of 1."""
     count = np.maximum(present.sum(axis=1), 1)[:, None]
     uv = (
         points[..., :2]
@@ -184,10 +191,10 @@ def _normalised(points: np.ndarray, present: np.ndarray) -> np.ndarray:
 
 
 def _changes(points: np.ndarray, present: np.ndarray) -> bool:
-    """Whether postures differ, as those of a moving person do."""
+    """Returns True if postures differ, as those of a moving person do."""
     often = present.mean(axis=0) > 0.5
     if not often.any():
         return True
     uv = np.where(present[..., None], _normalised(points, present), np.nan)[:, often]
     away = uv - np.nanmedian(uv, axis=0)
-    return bool(np.nanmedian(np.linalg.norm(away, axis=-1)) > _ALIVE)
+    return bool(np.nanmedian(np.linalg.norm(away, axis=-1)) > _MIN_POSTURE_CHANGE)

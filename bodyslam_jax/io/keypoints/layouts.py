@@ -24,8 +24,9 @@ class Layout:
     parts: list[int]
     """The part of the body that each point is, or -1 for none of them."""
     definition: str | None = None
-    """What its detectors call a hip or a knee, a name in `body.KEYPOINT_DEFINITIONS`;
-    `None` if detectors of several definitions write this order."""
+    """Definition of hip and knee of its detectors, a name in
+    `body.KEYPOINT_DEFINITIONS`; `None` if detectors of several definitions write this
+    order."""
 
 
 _AS_COCO17 = [0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11]
@@ -62,7 +63,7 @@ LAYOUTS: dict[int, dict[str, Layout]] = {
     # Face and hands follow.
     136: {"Halpe, full body": Layout([*_HALPE, *[-1] * 110], "halpe")},
 }
-"""By the number of keypoints: layouts of as many, the usual one first."""
+"""Layouts by their number of keypoints, the usual one first."""
 
 _MIDPOINTS = (
     (BODY25["neck"], BODY25["right_shoulder"], BODY25["left_shoulder"]),
@@ -72,12 +73,12 @@ _MIDPOINTS = (
 
 
 def usual_layout(num: int) -> Layout | None:
-    """The usual layout of `num` keypoints; `None` if none has as many."""
+    """Returns the usual layout of `num` keypoints; `None` if none has as many."""
     return next(iter(LAYOUTS.get(num, {}).values()), None)
 
 
 def from_layout(points: np.ndarray, layout: list[int]) -> np.ndarray:
-    """BODY_25 of keypoints (..., j, 3) whose parts are those of `layout`."""
+    """Returns BODY_25 of keypoints (..., j, 3) whose parts are those of `layout`."""
     index = np.full(25, -1)
     for place, part in enumerate(layout):
         if 0 <= part < 25:

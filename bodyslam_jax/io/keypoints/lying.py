@@ -1,4 +1,4 @@
-"""Whether people lie on their side because x and y were exchanged.
+"""Detects x and y that were exchanged, by people who lie on their side.
 
 With (y, x) in place of (x, y) everybody lies with the head to the left. So they do if
 the image is rotated by 90 degrees, but then they are not mirrored: in an upright image,
@@ -12,23 +12,23 @@ from jaxtyping import Float
 
 from bodyslam_jax.body.skeleton import BODY25, BODY25_FACE, BODY25_TOES_AND_HEELS
 
-_PRESENT = 0.05
-_SURE = 0.3
+_MIN_PRESENT_CONFIDENCE = 0.05
+_MIN_CONFIDENCE = 0.3
 _NECK, _MID_HIP = BODY25["neck"], BODY25["mid_hip"]
 _RIGHT, _LEFT = (
     (BODY25[f"{side}_shoulder"], BODY25[f"{side}_hip"]) for side in ("right", "left")
 )
 _FEET = (BODY25_TOES_AND_HEELS[:2], BODY25_TOES_AND_HEELS[2:])
 """Toe and heel of either foot."""
-_STEEP = 35.0
+_MAX_TRUNK_SLOPE_DEG = 35.0
 """Largest angle between the trunk of a lying person and the image's rows, degrees."""
-_ASIDE = 0.2
+_MIN_BREADTH_RATIO = 0.2
 """Ratio of breadth to length of the trunk below which a person is seen from the side,
-and left and right tell nothing."""
-_ALWAYS = 0.99
-"""If more than this share of the detections has a face, the detector gives a face to
-people seen from behind, too."""
-_FEWEST = 5
+and left and right are not informative."""
+_MAX_FACE_SHARE = 0.99
+"""Share of detections with a face above which the detector gives a face to people seen
+from behind, too."""
+_MIN_DETECTIONS = 5
 """Least number of detections for a decision."""
 
 
@@ -37,35 +37,39 @@ class Lying:
     """Detections that lie on their side with the head to the left of the image."""
 
     share: float
-    """Of all detections."""
+    """Share of all detections."""
     mirrored: float
     """Of the lying detections with evidence, the share whose face and feet fit an
     exchange of x and y; those of the others fit a rotation. NaN without evidence."""
 
 
 def lying(points: Float[np.ndarray, "n 25 3"], has_face: bool) -> Lying:
-    """Whether `n` detections (u px, v px, confidence; BODY_25 order) lie sideways, and
-    whether they are mirrored.
+    """Evaluates whether `n` detections (u px, v px, confidence; BODY_25 order) lie
+    sideways, and whether they are mirrored.
 
     Args:
         has_face: whether the detector's layout has nose and eyes, so that their absence
             means a person seen from behind.
     """
-    has_trunk = (points[:, [_NECK, _MID_HIP], 2] > _PRESENT).all(axis=1)
+    has_trunk = (points[:, [_NECK, _MID_HIP], 2] > _MIN_PRESENT_CONFIDENCE).all(axis=1)
     points = points[has_trunk]
     if not len(points):
         return Lying(0.0, np.nan)
     trunk = points[:, _MID_HIP, :2] - points[:, _NECK, :2]
     length = np.maximum(np.linalg.norm(trunk, axis=1), 1e-9)
-    flat = trunk[:, 0] > np.cos(np.radians(_STEEP)) * length
-    sure = points[..., 2] > _SURE
+    flat = trunk[:, 0] > np.cos(np.radians(_MAX_TRUNK_SLOPE_DEG)) * length
+    sure = points[..., 2] > _MIN_CONFIDENCE
     sides = zip(_RIGHT, _LEFT, strict=True)
     across = [points[:, r, 1] - points[:, l, 1] for r, l in sides]
     breadth = np.mean(across, axis=0) / length
-    usable = flat & sure[:, [*_RIGHT, *_LEFT]].all(axis=1) & (np.abs(breadth) > _ASIDE)
+    usable = (
+        flat
+        & sure[:, [*_RIGHT, *_LEFT]].all(axis=1)
+        & (np.abs(breadth) > _MIN_BREADTH_RATIO)
+    )
     facing = _facing(points, sure, length, has_face)
     usable &= facing != 0
-    if usable.sum() < _FEWEST:
+    if usable.sum() < _MIN_DETECTIONS:
         return Lying(float(flat.mean()), np.nan)
     # With x and y exchanged, the right side of a person who faces the camera has the
     # smaller y.
@@ -77,16 +81,16 @@ def lying(points: Float[np.ndarray, "n 25 3"], has_face: bool) -> Lying:
 def _facing(
     points: np.ndarray, sure: np.ndarray, length: np.ndarray, has_face: bool
 ) -> np.ndarray:
-    """Positive for people who face the camera, negative for those seen from behind, 0
-    for unknown.
+    """Returns positive numbers for people who face the camera, negative ones for those
+    seen from behind, 0 for unknown.
 
     By whether a face is detected; if everybody has one, by the feet: toes of a person
     who faces the camera are lower in an upright image than the heels, as the camera is
     above the ground. With the head to the left, lower is further to the right.
     """
     face = sure[:, list(BODY25_FACE)].sum(axis=1) >= 2
-    if has_face and face.mean() <= _ALWAYS:
-        none = (points[:, list(BODY25_FACE), 2] <= _PRESENT).all(axis=1)
+    if has_face and face.mean() <= _MAX_FACE_SHARE:
+        none = (points[:, list(BODY25_FACE), 2] <= _MIN_PRESENT_CONFIDENCE).all(axis=1)
         return np.where(face, 1.0, np.where(none, -1.0, 0.0))
     lower = np.zeros((len(_FEET), len(points)))
     for row, (toe, heel) in zip(lower, _FEET, strict=True):

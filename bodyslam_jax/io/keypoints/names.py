@@ -21,7 +21,7 @@ _MIDDLE = {
 
 
 def _sided(**parts: str) -> dict[str, tuple[int, int]]:
-    """Right and left keypoint of each part of BODY_25, by each word for it."""
+    """Returns right and left keypoint of each part of BODY_25, by each word for it."""
     return {
         word: (BODY25[f"right_{part}"], BODY25[f"left_{part}"])
         for part, words in parts.items()
@@ -42,24 +42,25 @@ _SIDED = _sided(
     small_toe="smalltoe littletoe",
     heel="heel",
 )
-_ELSE = _sided(wrist="hand", ankle="foot")
-"""Names that some files give wrist and ankle; they count if nothing else has them."""
+_SECOND_CHOICES = _sided(wrist="hand", ankle="foot")
+"""Names that some files give wrist and ankle; they count if no other name has them."""
 _RIGHT, _LEFT = {"right", "r"}, {"left", "l"}
 _LIMBS = {
     BODY25[f"{side}_{part}"]
     for side in ("right", "left")
     for part in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 }
-_FEWEST = 8
-"""Of the twelve joints of the limbs, so many must be named."""
+_MIN_LIMB_JOINTS = 8
+"""Least number of the twelve joints of the limbs that must be named."""
 
 
 def layout_of(names: Sequence[Any]) -> list[int] | None:
-    """The part of each name, as in `LAYOUTS`; `None` if too few are a body's."""
+    """Returns the part of each name, as in `LAYOUTS`; `None` if too few are a
+    body's."""
     words = [_words(str(name)) for name in names]
     layout = [_part(side, rest, _SIDED) for side, rest in words]
     for place, (side, rest) in enumerate(words):
-        part = _part(side, rest, _ELSE)
+        part = _part(side, rest, _SECOND_CHOICES)
         if part >= 0 and part not in layout:
             layout[place] = part
     taken: set[int] = set()
@@ -68,11 +69,12 @@ def layout_of(names: Sequence[Any]) -> list[int] | None:
         if part in taken:
             layout[place] = -1
         taken.add(part)
-    return layout if len(_LIMBS & set(layout)) >= _FEWEST else None
+    return layout if len(_LIMBS & set(layout)) >= _MIN_LIMB_JOINTS else None
 
 
 def names_in(data: Any) -> list[str] | None:
-    """The names of keypoints that a JSON file's header gives, in order; or None.
+    """Returns the names of keypoints that a JSON file's header gives, in order; or
+    None.
 
     easy_ViTPose has `skeleton`, by index; MMPose `keypoint_id2name` in its metadata;
     COCO lists of `keypoints` in `categories`; others plain lists.
@@ -100,7 +102,7 @@ _KEYS += ("joint_names", "keypoint_labels", "names", "bodyparts")
 
 
 def _listed(value: Any) -> list[str] | None:
-    """Names in order, of a list or by index; None if it is something else."""
+    """Returns names in order, of a list or by index; None if it is something else."""
     if isinstance(value, dict):
         try:
             value = {int(k): v for k, v in value.items()}
@@ -115,7 +117,8 @@ def _listed(value: Any) -> list[str] | None:
 
 
 def _words(name: str) -> tuple[str, str]:
-    """The side in a name, `r`, `l` or nothing, and the rest of the name, joined."""
+    """Returns the side in a name, `r`, `l` or nothing, and the rest of the name,
+    joined."""
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", name)
     words = [w for w in re.split(r"[^a-z0-9]+", name.lower()) if w]
     side = next((w for w in words if w in _RIGHT | _LEFT), "")

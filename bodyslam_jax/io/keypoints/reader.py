@@ -9,7 +9,9 @@ import logging
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Float
 
+from bodyslam_jax.body.skeleton import BODY25
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.archive import Archive
 from bodyslam_jax.io.budget import MAX_PEOPLE
@@ -23,15 +25,20 @@ from bodyslam_jax.io.keypoints.keypoint_format import (
     keypoint_formats,
     parsed,
 )
-from bodyslam_jax.io.keypoints.turned import turned_back
 
 _log = logging.getLogger(__name__)
 
 Detections = list[np.ndarray]
 """For each frame the keypoints (n, 25, 3) of `n` people: u px, v px, confidence."""
 
-_SURE = 0.3
-"""Confidence from which a keypoint's position is trusted."""
+_MIN_CONFIDENCE = 0.3
+"""Least confidence of a keypoint whose position is trusted."""
+_MIN_OUTSIDE_SHARE, _MIN_INSIDE_SHARE = 0.02, 0.995
+"""Least share of points outside the video, and within the rotated one, of keypoints in
+the stored frames of a phone's video, before its rotation tag."""
+_MIN_LYING_SHARE = 0.8
+"""Least share of people whose trunk is horizontal, there."""
+_NECK, _MID_HIP = BODY25["neck"], BODY25["mid_hip"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +50,7 @@ class Detected:
     """For each frame the numbers (n,) of its `n` people, the same for the same person;
     `None` if the file does not track people."""
     definition: str = UNKNOWN
-    """What the detector calls a hip or a knee: a name in
-    `body.KEYPOINT_DEFINITIONS`."""
+    """Definition of hip and knee, a name in `body.KEYPOINT_DEFINITIONS`."""
 
 
 def read_detections(
@@ -109,7 +115,7 @@ def read_detections(
 
 
 def _listed(path: Path, num_frames: int | None) -> Listed:
-    """The content of the file or folder, as its format reads it."""
+    """Returns the content of the file or folder, as its format reads it."""
     among = keypoint_formats()
     chosen, source = format_of(path, among, parsed)
     if chosen is not None:
@@ -128,7 +134,8 @@ def _listed(path: Path, num_frames: int | None) -> Listed:
 
 
 def _checked(person: list[np.ndarray], warn: Warn) -> list[np.ndarray] | None:
-    """The numbers of people, if everybody has one and nobody two in a frame."""
+    """Returns the numbers of people, if all have one and no two in a frame have the
+    same."""
     numbers = np.concatenate(person) if person else np.zeros(0)
     if not (numbers >= 0).any():
         return None
@@ -159,7 +166,7 @@ def _to_pixels(
     present = points[..., 2] > 0
     if not present.any():
         raise InputError(f"{path}: all confidences are zero.")
-    sure = points[..., 2] > _SURE
+    sure = points[..., 2] > _MIN_CONFIDENCE
     sure = sure if sure.any() else present
     if (uv := _relative(points, sure, size, warn)) is not None:
         points[..., :2] = uv
@@ -169,9 +176,9 @@ def _to_pixels(
         except InvalidContent as error:
             raise InputError(f"{path}: {error}") from None
         points[..., :2] = scaled(points[..., :2], factor)
-    at = points[points[..., 2] > _SURE][:, :2]
+    at = points[points[..., 2] > _MIN_CONFIDENCE][:, :2]
     outside = ((at < 0) | (at > size)).any(axis=-1)
-    if (turned := turned_back(points, sure, size, warn)) is not None:
+    if (turned := _rotated_upright(points, sure, size, warn)) is not None:
         points[..., :2] = turned
     elif len(at) and outside.mean() > 0.3:
         raise InputError(
@@ -189,8 +196,8 @@ def _to_pixels(
 def _relative(
     points: np.ndarray, sure: np.ndarray, size: tuple[int, int], warn: Warn
 ) -> np.ndarray | None:
-    """Pixels of points that are relative to the image, in [0, 1] or [-1, 1]; `None` if
-    they are pixels already.
+    """Returns pixels of points that are relative to the image, in [0, 1] or [-1, 1];
+    `None` if they are pixels already.
 
     Decided by quantiles: single points may be well outside the image.
     """
@@ -202,3 +209,43 @@ def _relative(
     zero = -1.0 if low.min() < -0.1 else 0.0
     warn(f"keypoints in [{zero:g}, 1]: taken as relative to the size of the image.")
     return (uv - zero) / (1 - zero) * (np.asarray(size, dtype=np.float64) - 1)
+
+
+def _rotated_upright(
+    points: Float[np.ndarray, "m 25 3"],
+    sure: Bool[np.ndarray, "m 25"],
+    size: tuple[int, int],
+    warn: Warn,
+) -> Float[np.ndarray, "m 25 2"] | None:
+    """Returns pixels of the video of `size` (width, height), if the points fit a video
+    of height x width in which people lie; `None` otherwise.
+
+    The rotation is the one that turns heads up.
+
+    Args:
+        points: u px, v px, confidence.
+        sure: points whose position is trusted.
+    """
+    width, height = size
+    uv = points[..., :2]
+    inside = lambda limit: ((uv[sure] >= 0) & (uv[sure] <= limit)).all(axis=-1)
+    beyond = np.any(uv[sure] > np.array([width, height]), axis=-1)
+    if not len(beyond) or beyond.mean() < _MIN_OUTSIDE_SHARE:
+        return None
+    trunk = (uv[:, _MID_HIP] - uv[:, _NECK])[sure[:, _NECK] & sure[:, _MID_HIP]]
+    across = np.abs(trunk[:, 0]) > 2 * np.abs(trunk[:, 1])
+    if inside(np.array([height, width])).mean() < _MIN_INSIDE_SHARE or not len(trunk):
+        return None
+    right = float((across & (trunk[:, 0] < 0)).mean())  # heads
+    left = float((across & (trunk[:, 0] > 0)).mean())
+    if max(left, right) < _MIN_LYING_SHARE:
+        return None
+    warn(
+        f"keypoints are of a video of {height}x{width} px in which people lie, this "
+        f"one has {width}x{height} px: taken as detected before the video's rotation "
+        "was applied, and turned."
+    )
+    u, v = uv[..., 0], uv[..., 1]
+    if right > left:  # the stored image is the shown one turned clockwise
+        return np.stack([v, height - 1 - u], axis=-1)
+    return np.stack([width - 1 - v, u], axis=-1)

@@ -15,9 +15,9 @@ from bodyslam_jax.io.frame_index import InvalidContent
 
 _RATES = ("mocap_framerate", "mocap_frame_rate")
 """AMASS's names of the frame rate: in releases with SMPL-H, and with SMPL-X."""
-_SMPLX = 165
-"""Numbers in a pose of SMPL-X: 3 for each of 55 joints."""
-_SAME_RATE = 0.01
+_SMPLX_VALUES = 165
+"""Number of values in a pose of SMPL-X: 3 for each of 55 joints."""
+_RATE_TOLERANCE = 0.01
 """Relative difference of rates that counts as rounding."""
 _MAX_RATIO = 2.5
 """Ratio of the durations of motion and video above which they do not belong
@@ -37,7 +37,7 @@ class Amass(BodyFormat):
     layout = ("trans", "betas")
 
     def recognises(self, source: Source) -> bool:
-        """Whether these are AMASS' arrays, of any of its releases."""
+        """Returns True if these are AMASS' arrays, of any of its releases."""
         if not super().recognises(source):
             return False
         names = set(source.content)
@@ -82,9 +82,10 @@ class Amass(BodyFormat):
 
 
 def is_smplx(data: dict, width: int) -> bool:
-    """Whether the poses are SMPL-X's, by their width or by `surface_model_type`."""
+    """Returns True if the poses are SMPL-X's, by their width or by
+    `surface_model_type`."""
     named = str(np.asarray(data.get("surface_model_type", "")).reshape(-1)[:1])
-    return width == _SMPLX or "smplx" in named
+    return width == _SMPLX_VALUES or "smplx" in named
 
 
 def write_body(
@@ -109,8 +110,9 @@ def body_pose(poses: Float[np.ndarray, "t p"]) -> Float[np.ndarray, "t 72"]:
 
 
 def _positions(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
-    """The (fractional) frame of a motion of `n` frames at the time of each frame of the
-    video; and by how many frames its last one may be exceeded."""
+    """Returns the (fractional) frame of a motion of `n` frames at the time of each
+    frame of the video, and the number of frames by which its last one may be
+    exceeded."""
     t, fps = video.num_frames, video.fps
     if t is None:
         t = n if fps is None else round((n - 1) / rate * fps) + 1
@@ -123,7 +125,7 @@ def _positions(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
     times = np.arange(t) / fps if video.times is None else video.times - video.times[0]
     filmed = float(times[-1]) * t / (t - 1) if t > 1 else 1 / fps
     moved = n / rate
-    if n == t and abs(moved / filmed - 1) < _SAME_RATE:
+    if n == t and abs(moved / filmed - 1) < _RATE_TOLERANCE:
         return np.arange(float(n)), 0.5
     if not 1 / _MAX_RATIO < moved / filmed < _MAX_RATIO:
         raise InvalidContent(
@@ -143,7 +145,8 @@ def _positions(n: int, rate: float, video: Video) -> tuple[np.ndarray, float]:
 def _between(
     poses: np.ndarray, trans: np.ndarray, at: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (t, 72) and positions (t, 3) between frames; rotations on the geodesic."""
+    """Returns poses (t, 72) and positions (t, 3) between frames; rotations are
+    interpolated on the geodesic."""
     low = np.floor(at).astype(np.int64)
     high = np.minimum(low + 1, len(poses) - 1)
     part = (at - low)[:, None]

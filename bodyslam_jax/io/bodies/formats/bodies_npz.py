@@ -54,7 +54,8 @@ class BodiesNpz(BodyFormat):
 
 
 def _as_smpl(data: dict) -> dict:
-    """The data with SMPL's poses, if they are as wide as SMPL-H's or SMPL-X's."""
+    """Returns the data with SMPL's poses, if they are as wide as SMPL-H's or
+    SMPL-X's."""
     poses, betas = (numbers_of(data, name, None) for name in ("poses", "betas"))
     if poses.ndim != 2 or poses.shape[1] not in (66, 156, 165):
         poses72 = poses

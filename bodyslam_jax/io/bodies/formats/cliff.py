@@ -30,8 +30,8 @@ class Cliff(BodyFormat):
     layout = ("pose", "shape", "global_t")
 
     def focal(self, camera: Intrinsics) -> float:
-        """The diagonal (`estimate_focal_length`, `common/utils.py`), where the file has
-        no `focal_l`."""
+        """Returns the diagonal (`estimate_focal_length`, `common/utils.py`), where the
+        file has no `focal_l`."""
         return diagonal(camera)
 
     def read(self, source: Source, video: Video) -> Rows:
@@ -67,8 +67,8 @@ class Cliff(BodyFormat):
 
 
 def _image_of_each(data: dict, n: int, images: int) -> np.ndarray | None:
-    """The image of each of `n` bodies, if images are named once: the first column of
-    `detection_all`. `None` if each body has an image name of its own."""
+    """Returns the image of each of `n` bodies, if images are named once: the first
+    column of `detection_all`. `None` if each body has an image name of its own."""
     if "detection_all" in data:
         rows = numbers_of(data, "detection_all", None)
         image = rows.reshape(len(rows), -1)[:, 0] if rows.size else np.zeros(0)

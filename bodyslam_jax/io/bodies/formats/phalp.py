@@ -26,7 +26,7 @@ class Phalp(BodyFormat):
     by_entry = True
 
     def focal(self, camera: Intrinsics) -> float:
-        """5000 px for a crop of 256 px, so 5000/256 of the longer side
+        """Returns 5000 px for a crop of 256 px, so 5000/256 of the longer side
         (`EXTRA.FOCAL_LENGTH / MODEL.IMAGE_SIZE * img_size.max()`, `demo.py`)."""
         return 5000 / 256 * max(camera.width, camera.height)
 
@@ -70,7 +70,8 @@ class Phalp(BodyFormat):
 
 
 def _factor(data: dict, video: Video) -> float:
-    """Pixels of the video per pixel of PHALP's images, whose `size` is (h, w)."""
+    """Returns pixels of the video per pixel of PHALP's images, whose `size` is (h,
+    w)."""
     sizes = {
         tuple(np.ravel(size)[:2].tolist())
         for found in data.values()

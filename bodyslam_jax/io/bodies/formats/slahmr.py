@@ -34,7 +34,7 @@ class Slahmr(BodyFormat):
     layout = ("trans", "root_orient", "pose_body")
 
     def recognises(self, source: Source) -> bool:
-        """Whether the arrays have SLAHMR's names and axes."""
+        """Returns True if the arrays have SLAHMR's names and axes."""
         return super().recognises(source) and np.ndim(source.content["trans"]) == 3
 
     def read(self, source: Source, video: Video) -> Rows:
@@ -87,7 +87,7 @@ class Slahmr(BodyFormat):
 
 
 def _info_beside(path: Path) -> "_Info | None":
-    """The content of the results' `track_info.json`, if there is one."""
+    """Returns the content of the results' `track_info.json`, if there is one."""
     for folder in (path.parent, path.parent.parent):
         file = folder / "track_info.json"
         if file.is_file():
@@ -118,7 +118,7 @@ class _Info:
         return cls(before + int(start), masks)
 
     def visible(self, people: int, frames: int) -> np.ndarray:
-        """Whether each person is visible in each frame, (people, frames)."""
+        """Returns whether each person is visible in each frame, (people, frames)."""
         found = np.ones((people, frames), dtype=bool)
         for index, mask in self.masks.items():
             if index < people:
@@ -127,7 +127,7 @@ class _Info:
 
 
 def _composed(R: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
-    """Axis-angle of `R exp(rotvec)`; NaN where either is not finite."""
+    """Returns the axis-angle of `R exp(rotvec)`; NaN where either is not finite."""
     both = np.hstack([R.reshape(-1, 9), rotvec])
     finite = np.asarray(np.isfinite(both).all(axis=1))[:, None]
     safe = np.where(finite[..., None], R, np.eye(3)), np.where(finite, rotvec, 0.0)

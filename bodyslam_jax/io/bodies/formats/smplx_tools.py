@@ -28,8 +28,8 @@ class Gvhmr(BodyFormat):
     layout = ("smpl_params_incam",)
 
     def focal(self, camera: Intrinsics) -> float:
-        """The diagonal (`estimate_focal_length`, `hmr4d/utils/geo/hmr_cam.py`), where
-        the file has no `K_fullimg`."""
+        """Returns the diagonal (`estimate_focal_length`, `hmr4d/utils/geo/hmr_cam.py`),
+        where the file has no `K_fullimg`."""
         return diagonal(camera)
 
     def read(self, source: Source, video: Video) -> Rows:

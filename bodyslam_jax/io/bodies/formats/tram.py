@@ -35,7 +35,7 @@ class Tram(BodyFormat):
         return super().recognises(source)
 
     def focal(self, camera: Intrinsics) -> float:
-        """The diagonal (`est_focal` of its datasets), where `camera.npy` has no
+        """Returns the diagonal (`est_focal` of its datasets), where `camera.npy` has no
         `img_focal`."""
         return diagonal(camera)
 
@@ -63,7 +63,7 @@ class Tram(BodyFormat):
         )
 
     def _read_folder(self, folder: Path, video: Video) -> Rows:
-        """`hps/` (one file per person), with `camera.npy` beside or above it."""
+        """Reads `hps/` (one file per person), with `camera.npy` beside or above it."""
         tracks = sorted(folder.glob(f"**/{self.folder}"))
         cameras = [p / "camera.npy" for p in (folder, tracks[0].parent, folder.parent)]
         camera_file = next((p for p in cameras if p.is_file()), None)

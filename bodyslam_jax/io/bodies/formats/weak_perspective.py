@@ -56,7 +56,8 @@ class Vibe(BodyFormat):
 
 
 def from_spin(data: dict, video: Video) -> Rows:
-    """Bodies with `camera` (m, 3: s, tx, ty) in boxes `bbox` (m, 3: cx, cy, side px).
+    """Returns bodies with `camera` (m, 3: s, tx, ty) in boxes `bbox` (m, 3: cx, cy,
+    side px).
 
     **Raises:** `InvalidContent` if an array is missing or of another shape.
     """

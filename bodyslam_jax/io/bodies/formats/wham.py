@@ -18,7 +18,7 @@ class Wham(BodyFormat):
     by_entry = True
 
     def focal(self, camera: Intrinsics) -> float:
-        """The diagonal, also where a calibration is given: that is for SLAM
+        """Returns the diagonal, also where a calibration is given: that is for SLAM
         (`compute_cam_intrinsics`, `lib/utils/imutils.py`, called by
         `lib/data/datasets/dataset_custom.py`)."""
         return diagonal(camera)

@@ -18,8 +18,8 @@ from bodyslam_jax.io.keypoints.keypoint_format import (
     part_names,
 )
 
-_SMALL = 300
-"""Entries of an array that may be metadata."""
+_MAX_METADATA_ENTRIES = 300
+"""Largest number of entries of an array that may be metadata."""
 
 
 class Arrays(KeypointFormat):
@@ -74,11 +74,11 @@ class Arrays(KeypointFormat):
 
 
 def _header(archive: Archive) -> dict[str, Any]:
-    """The small arrays of numbers or text beside the keypoints, as lists."""
+    """Returns the small arrays of numbers or text beside the keypoints, as lists."""
     found = {}
     for name in archive.names:
         shape, dtype = archive.header(name)
-        if math.prod(shape) < _SMALL and dtype.kind in "fiuU":
+        if math.prod(shape) < _MAX_METADATA_ENTRIES and dtype.kind in "fiuU":
             with reading(archive.path, f"`{name}` of numbers or text"):
                 found[name] = archive.raw(name).tolist()
     return found

@@ -35,7 +35,8 @@ class OpenPose(KeypointFormat):
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files of the frames; some tools leave out `_keypoints` in their names."""
+    """Returns the files of the frames; some tools leave out `_keypoints` in their
+    names."""
     return sorted(folder.glob(OpenPose.folder)) or sorted(folder.glob("*.json"))
 
 
