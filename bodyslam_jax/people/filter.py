@@ -1,4 +1,4 @@
-"""One person, frame after frame: an iterated extended Kalman filter of their body.
+"""An iterated extended Kalman filter of one person's body, frame after frame.
 
 The state is that of a fit (`costs.Fit`): root orientation, pelvis, posture. It is
 predicted by a constant velocity of the root and the posture's first-order
@@ -29,44 +29,51 @@ from bodyslam_jax.people.keypoint_errors import (
     keypoint_sigma,
     pixels_per_metre,
 )
-from bodyslam_jax.people.lift import REACH, SPACING, Lifter, lift, load_lifter
+from bodyslam_jax.people.lift import (
+    NUM_SIDE_FRAMES,
+    SPACING_S,
+    Lifter,
+    lift,
+    load_lifter,
+)
 from bodyslam_jax.people.skeleton import NUM_SHAPE
 from bodyslam_jax.types import Intrinsics, Keypoints
 
-_START_STEPS, _STEPS = 15, 3
+_NUM_FIRST_STEPS, _NUM_STEPS = 15, 3
 _ROOT_SIGMA = np.array([0.5, 0.5, 0.5, 0.5, 0.5, 2.0])
 """Uncertainty of the root before the first frame, rad and m."""
-_TURN, _MOVE, _DEPTH = 0.05, 0.02, 0.02
-"""Standard deviation of what a constant velocity of the root is off by in a frame of
-1/30 s: rad, m across the view, m along it."""
-_LOOSE = 4.0
+_TURN_SIGMA_RAD, _MOVE_SIGMA_M, _DEPTH_SIGMA_M = 0.05, 0.02, 0.02
+"""Standard deviation of the deviation from a constant velocity of the root in a frame
+of 1/30 s: rad, m across the view, m along it."""
+_INNOVATION_FACTOR = 4.0
 """Factor on the posture prior's innovations, as in the fit of all frames."""
-_FADING = 0.3
-"""Time constant with which a velocity that is not measured fades, s."""
-_CAUSAL = 1.5
+_VELOCITY_DECAY_S = 0.3
+"""Time constant with which an unmeasured velocity decays, s."""
+_CAUSAL_FACTOR = 1.5
 """Factor on the lifted posture's standard deviations: the network expects half a second
-that is still to come, and sees the last frame stand still instead."""
-_HISTORY = 2 * REACH + 1
-_LEAST_GAP = 1e-3
-"""s between two updates."""
-_REMEMBERED = 3.0
-"""s for which keypoints are remembered, for a filter that begins anew."""
-_ANCHORED = np.array([0.1, 0.1, 0.1, 0.03, 0.03, 0.08])
-"""Uncertainty of a root from a window's newest frames, rad and m."""
-_ANCHORED_POSTURE = 0.4
-"""The same of a posture, in standard deviations of the prior's components."""
+that is still to come, and gets the last frame repeated instead."""
+_HISTORY_FRAMES = 2 * NUM_SIDE_FRAMES + 1
+_MIN_GAP_S = 1e-3
+"""Least time between two updates, s."""
+_MAX_HISTORY_S = 3.0
+"""Time for which keypoints are kept, for a filter that begins again, s."""
+_ANCHOR_ROOT_SIGMA = np.array([0.1, 0.1, 0.1, 0.03, 0.03, 0.08])
+"""Standard deviations of a root from a window's newest frames, rad and m."""
+_ANCHOR_POSTURE_SIGMA = 0.4
+"""Standard deviation of a posture from these frames, in those of the prior's
+components."""
 
 
 class Belief(eqx.Module):
-    """Where a body is, how it moves, and how sure that is."""
+    """The mean and covariance of a body's state."""
 
     fit: Fit
     turning: Float[Array, " 3"]
     """Angular velocity of the root in C, rad/s."""
     velocity: Float[Array, " 3"]
-    """Of the pelvis in C, m/s."""
+    """Velocity of the pelvis in C, m/s."""
     covariance: Float[Array, "n n"]
-    """Of root and posture, in the step of `Fit.moved`."""
+    """Covariance of root and posture, in the step of `Fit.moved`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +81,7 @@ class Body:
     """A person in one frame."""
 
     T_CH: Float[np.ndarray, "4 4"]
-    """m"""
+    """Root in the camera frame, m."""
     body_pose: Float[np.ndarray, "23 3"]
     """θ, rad."""
 
@@ -102,19 +109,18 @@ class PersonFilter:
         points: Float[np.ndarray, "25 3"],
         shape: Float[np.ndarray, " 10"],
     ) -> Body | None:
-        """The body at `time` (s), by keypoints (u px, v px, confidence) and a shape;
-        `None` with fewer keypoints than a first frame must have."""
+        """Returns the body at `time` (s), by keypoints (u px, v px, confidence) and a
+        shape; `None` with fewer keypoints than a first frame needs."""
         uv, sigma = self._measured(points)
         self.recent.append((time, uv, sigma))
-        while time - self.recent[0][0] > _REMEMBERED:
+        while time - self.recent[0][0] > _MAX_HISTORY_S:
             self.recent.popleft()
         return self._step(time, uv, sigma, shape)
 
     def anchor(self, time: float, body: Body, shape: Float[np.ndarray, " 10"]) -> None:
-        """Begins anew at an earlier time, with a body that all measurements around it
-        told, and goes through the keypoints since then once more, at the lifting
-        network's rate."""
-        if self.belief is None or time < self.recent[0][0] - SPACING:
+        """Begins again at an earlier time, with a body that a window has solved, and
+        filters the keypoints since then once more, at the lifting network's rate."""
+        if self.belief is None or time < self.recent[0][0] - SPACING_S:
             return
         dtype = self.scene.intrinsics.dtype
         prior = self.scene.prior
@@ -125,15 +131,17 @@ class PersonFilter:
             jnp.asarray(body.T_CH[:3, 3], dtype),
             jnp.asarray(latent, dtype),
         )
-        sigma = np.concatenate([_ANCHORED, np.full(len(latent), _ANCHORED_POSTURE)])
+        sigma = np.concatenate(
+            [_ANCHOR_ROOT_SIGMA, np.full(len(latent), _ANCHOR_POSTURE_SIGMA)]
+        )
         self.belief = dataclasses.replace(
             self.belief, fit=fit, covariance=jnp.asarray(np.diag(sigma**2), dtype)
         )
         newest = self.recent[-1][0]
         self.time = time
         for at, uv, known in list(self.recent):
-            if at - self.time >= SPACING - 1e-6 or (
-                at == newest and at - self.time > _LEAST_GAP
+            if at - self.time >= SPACING_S - 1e-6 or (
+                at == newest and at - self.time > _MIN_GAP_S
             ):
                 self._step(at, uv, known, shape)
 
@@ -163,7 +171,7 @@ class PersonFilter:
             *(number(x) for x in (uv, pixels, full)),
         )
         first = self.belief is None
-        gap = 1 / self.fps if first else max(time - self.time, _LEAST_GAP)
+        gap = 1 / self.fps if first else max(time - self.time, _MIN_GAP_S)
         belief = self.belief or _blank(self.scene)
         self.belief = _updated(
             self.scene,
@@ -172,7 +180,7 @@ class PersonFilter:
             jnp.asarray(first),
             number(gap),
             number(self.fps),
-            jnp.asarray(_START_STEPS if first else _STEPS),
+            jnp.asarray(_NUM_FIRST_STEPS if first else _NUM_STEPS),
             *given,
         )
         self.time = time
@@ -183,7 +191,7 @@ class PersonFilter:
         return self.body()
 
     def body(self) -> Body:
-        """The person as they are believed to be.
+        """Returns the mean of the belief.
 
         **Raises:** `ValueError` before the first frame.
         """
@@ -203,9 +211,10 @@ class PersonFilter:
     def _history(
         self, time: float
     ) -> tuple[Float[np.ndarray, "w 25 2"], Float[np.ndarray, "w 25"]]:
-        """Keypoints of the last second, `SPACING` apart, the newest last."""
+        """Returns the keypoints of the last second, `SPACING_S` apart, the newest
+        last."""
         times = np.array([r[0] for r in self.recent if r[0] <= time])
-        wanted = time - SPACING * np.arange(_HISTORY - 1, -1, -1)
+        wanted = time - SPACING_S * np.arange(_HISTORY_FRAMES - 1, -1, -1)
         near = np.abs(times[None] - wanted[:, None]).argmin(axis=1)
         uv, sigma = (np.stack([self.recent[k][i] for k in near]) for i in (1, 2))
         return uv, sigma
@@ -242,11 +251,13 @@ def _updated(
     sigma: Float[Array, " 25"],
     shape: Float[Array, " s"],
 ) -> Belief:
-    rate = jnp.asarray(1 / SPACING, uv.dtype)
+    rate = jnp.asarray(1 / SPACING_S, uv.dtype)
     given = scene.intrinsics, recent_uv, recent_sigma, rate
     guessed, usable = lift(lifter, *given)
     last = jax.tree.map(lambda a: a[-1], guessed)
-    lifted = last.widened(jnp.where(usable[-1], _CAUSAL, jnp.inf).astype(uv.dtype))
+    lifted = last.widened(
+        jnp.where(usable[-1], _CAUSAL_FACTOR, jnp.inf).astype(uv.dtype)
+    )
     started = first_fit(scene, uv, sigma, last)
     predicted, covariance = _predicted(scene, belief, gap, fps)
     choose = lambda a, b: jnp.where(first, a, b)
@@ -278,7 +289,7 @@ def _updated(
     spread = jnp.linalg.inv(hessian + 1e-6 * jnp.eye(size, dtype=hessian.dtype))
     turned = so3.log(fit.orientation @ belief.fit.orientation.T) / gap
     moved = (fit.position - belief.fit.position) / gap
-    share = jnp.minimum(1.0, gap / (_FADING / 3))
+    share = jnp.minimum(1.0, gap / (_VELOCITY_DECAY_S / 3))
     mean = lambda new, old: choose(jnp.zeros_like(old), old + share * (new - old))
     return Belief(
         fit,
@@ -292,8 +303,8 @@ def _predicted(
     scene: Scene, belief: Belief, gap: Float[Array, ""], fps: Float[Array, ""]
 ) -> tuple[Fit, Float[Array, "n n"]]:
     frames = gap * fps
-    fading = jnp.exp(-gap / _FADING)
-    travel = _FADING * (1 - fading)
+    fading = jnp.exp(-gap / _VELOCITY_DECAY_S)
+    travel = _VELOCITY_DECAY_S * (1 - fading)
     a1, a2 = scene.prior.autoregression.T
     lag = jnp.clip(a1 / (1 - a2), 0.0, 0.999) ** frames
     fit = belief.fit
@@ -304,9 +315,11 @@ def _predicted(
     )
     depth = jnp.maximum(moved.position[2], 0.3)
     moved = eqx.tree_at(lambda f: f.position, moved, moved.position.at[2].set(depth))
-    root = jnp.array([_TURN] * 3 + [_MOVE] * 2 + [_DEPTH], gap.dtype)
+    root = jnp.array(
+        [_TURN_SIGMA_RAD] * 3 + [_MOVE_SIGMA_M] * 2 + [_DEPTH_SIGMA_M], gap.dtype
+    )
     ticks = gap * 30.0
-    noise = jnp.concatenate([root**2 * ticks, _LOOSE * (1 - lag**2)])
+    noise = jnp.concatenate([root**2 * ticks, _INNOVATION_FACTOR * (1 - lag**2)])
     keep = jnp.concatenate([jnp.ones(6, gap.dtype), lag])
     covariance = keep[:, None] * belief.covariance * keep + jnp.diag(noise)
     return moved, covariance

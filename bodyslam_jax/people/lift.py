@@ -23,17 +23,17 @@ from bodyslam_jax.io.archive import read_npz
 from bodyslam_jax.people.costs import KEYPOINT_SIGMA, Lifted
 
 ASSET = Path(__file__).parent / "assets" / "lifter.npz"
-SPACING = 0.1
-"""s between the network's input frames."""
-REACH = 5
-"""Input frames before, and after, the middle one."""
-NUM_FEATURES = (2 * REACH + 1) * 25 * 3
-_KEPT = 0.8
-"""Share of hidden units, while training."""
+SPACING_S = 0.1
+"""Time between the network's input frames, s."""
+NUM_SIDE_FRAMES = 5
+"""Number of input frames before, and after, the middle one."""
+NUM_FEATURES = (2 * NUM_SIDE_FRAMES + 1) * 25 * 3
+_KEPT_SHARE = 0.8
+"""Share of hidden units that dropout keeps in training."""
 _NECK, _HIPS = 1, 8
-_SIZE = 0.5
+_INPUT_RMS = 0.5
 """Root mean square of the input coordinates, in the frame where it is largest."""
-_FEWEST = 6
+_MIN_KEYPOINTS = 6
 """Least number of keypoints of a frame that is used."""
 
 
@@ -71,12 +71,13 @@ class Lifter(eqx.Module):
 def _dropped(
     h: Float[Array, "*b h"], key: PRNGKeyArray, number: int
 ) -> Float[Array, "*b h"]:
-    keep = jax.random.bernoulli(jax.random.fold_in(key, number), _KEPT, h.shape)
-    return h * keep.astype(h.dtype) / _KEPT
+    keep = jax.random.bernoulli(jax.random.fold_in(key, number), _KEPT_SHARE, h.shape)
+    return h * keep.astype(h.dtype) / _KEPT_SHARE
 
 
 def _orthonormal(columns: Float[Array, "*b 6"]) -> Float[Array, "*b 3 3"]:
-    """Gram and Schmidt (Zhou et al., CVPR 2019)."""
+    """Returns the rotation of two columns by Gram and Schmidt (Zhou et al., CVPR
+    2019)."""
     unit = lambda v: v / jnp.sqrt(jnp.sum(v**2, -1, keepdims=True) + 1e-12)
     x, y = unit(columns[..., :3]), columns[..., 3:]
     y = unit(y - jnp.sum(x * y, -1, keepdims=True) * x)
@@ -85,7 +86,7 @@ def _orthonormal(columns: Float[Array, "*b 6"]) -> Float[Array, "*b 3 3"]:
 
 @functools.cache
 def load_lifter(path: Path = ASSET) -> Lifter:
-    """The network that ships with the package, or another, in float32."""
+    """Returns the network that ships with the package, or another, in float32."""
     archive = read_npz(path, "a lifting network (.npz)")
     names = ("first", "hidden", "last", "bias", "last_bias")
     return Lifter(*(jnp.asarray(archive.array(n), jnp.float32) for n in names))
@@ -99,7 +100,7 @@ def lift(
     sigma: Float[Array, "t 25"],
     fps: Float[Array, ""],
 ) -> tuple[Lifted, Bool[Array, " t"]]:
-    """Predicted postures in the camera frame for all frames of one person.
+    """Returns predicted postures in the camera frame for all frames of one person.
 
     **Arguments:** `sigma`, as `keypoint_sigma` has it: m, `inf` for missing keypoints.
 
@@ -118,8 +119,8 @@ def features(
     sigma: Float[Array, "t 25"],
     fps: Float[Array, ""],
 ) -> tuple[Float[Array, "t f"], Float[Array, "t 3 3"], Bool[Array, " t"]]:
-    """The network's input, the rotation from C to the frame of the input, and the
-    frames with enough keypoints.
+    """Returns the network's input, the rotation from C to the frame of the input, and
+    the frames with enough keypoints.
 
     The z axis of that frame is the ray to the person, the trunk is upright in it on
     average over the window, and coordinates are scaled to a size of 1/2. So the input
@@ -128,7 +129,7 @@ def features(
     relative = jnp.where(
         sigma < jnp.inf, jnp.asarray(KEYPOINT_SIGMA, uv.dtype) / sigma, 0
     )
-    enough = jnp.sum(relative > 0, axis=1) >= _FEWEST
+    enough = jnp.sum(relative > 0, axis=1) >= _MIN_KEYPOINTS
     mark = jnp.where(enough[:, None], relative, 0)
     present = mark > 0
     rays = jnp.where(present[..., None], unproject(intrinsics, uv), 0)
@@ -143,20 +144,25 @@ def features(
     trunk = flat[:, _NECK] - flat[:, _HIPS]
     trunk = jnp.where((present[:, _NECK] & present[:, _HIPS])[:, None], trunk, 0)
 
-    step = jnp.arange(-REACH, REACH + 1, dtype=uv.dtype) * SPACING * fps
+    step = (
+        jnp.arange(-NUM_SIDE_FRAMES, NUM_SIDE_FRAMES + 1, dtype=uv.dtype)
+        * SPACING_S
+        * fps
+    )
     index = jnp.arange(len(uv))[:, None] + jnp.round(step).astype(int)
     index = jnp.clip(index, 0, len(uv) - 1)
     upright = _turn_upright(jnp.sum(trunk[index], axis=1))
     largest = jnp.maximum(jnp.max(size[index], axis=1), 1e-6)
     shape = jnp.einsum("tij,twkj->twki", upright[:, :2, :2], flat[index])
-    shape = shape * (_SIZE / largest)[:, None, None, None]
+    shape = shape * (_INPUT_RMS / largest)[:, None, None, None]
     x = jnp.concatenate([shape, mark[index][..., None]], -1)
     x = x.reshape(len(uv), NUM_FEATURES).astype(jnp.float32)
     return x, upright @ view, enough
 
 
 def _turn_upright(trunk: Float[Array, "t 2"]) -> Float[Array, "t 3 3"]:
-    """About z, so that the trunk points to -y; none where it is not seen."""
+    """Returns the rotation about z by which the trunk points to -y; the identity where
+    it is not visible."""
     length = jnp.sqrt(jnp.sum(trunk**2, -1, keepdims=True))
     up = jnp.array([0.0, -1.0], trunk.dtype)
     x, y = jnp.where(length > 1e-6, trunk / jnp.maximum(length, 1e-6), up).T
@@ -166,7 +172,7 @@ def _turn_upright(trunk: Float[Array, "t 2"]) -> Float[Array, "t 3 3"]:
 
 
 def _turn_to_axis(ray: Float[Array, "t 3"]) -> Float[Array, "t 3 3"]:
-    """The smallest rotation that takes each ray to +z; none points to -z."""
+    """Returns the smallest rotation that takes each ray to +z; no ray points to -z."""
     x, y, z = (ray / jnp.linalg.norm(ray, axis=-1, keepdims=True)).T
     h = 1 / (1 + z)
     rows = [[1 - h * x * x, -h * x * y, -x], [-h * x * y, 1 - h * y * y, -y], [x, y, z]]

@@ -1,9 +1,9 @@
-"""Who is in the images of a running video: detections, tracks, and persons who return.
+"""Finds and identifies people in the images of a running video.
 
-The networks that ship look at a square around everybody who is followed, and every
-third of a second at the whole image for somebody new. Given keypoints are tracked in
-the same way. A track that lasts is a person; one that begins where somebody with the
-same clothes was lost is that person again. Looks are kept in memory only.
+The networks that ship search a square around each tracked person, and every third of a
+second the whole image for a new one. Given keypoints are tracked in the same way. A
+track of some duration is a person; one that begins where a person with the same clothes
+was lost is that person again. Descriptions of clothes are kept in memory only.
 """
 
 import dataclasses
@@ -20,37 +20,39 @@ from bodyslam_jax.people.networks import BLAZEPOSE, MOVENET, open_network
 from bodyslam_jax.people.regions import behind, regions
 from bodyslam_jax.people.tracking import MAX_COLOUR_DIFFERENCE, Tracker, height
 
-_INTERVAL, _SELDOM = 0.33, 1.0
-"""s between two searches of the whole image: without anybody, and with."""
-_SEARCH, _SQUARE = 320, 256
+_SEARCH_INTERVAL_S, _SEARCH_INTERVAL_TRACKED_S = 0.33, 1.0
+"""Time between two searches of the whole image, s: while nobody is tracked, and
+otherwise."""
+_IMAGE_SIDE_PX, _SQUARE_SIDE_PX = 320, 256
 """Longer side of MoveNet's input, px: of the whole image, and of a square."""
-_START, _CONTINUE = 0.22, 0.12
-"""Least score that begins a track, and that continues one."""
-_MOST = 4
-"""People who are followed, the largest ones."""
-_PRESENCE = 0.5
-_LASTS = 0.2
-"""s: shorter tracks are nobody."""
-_SAME_CLOTHES = 0.6 * MAX_COLOUR_DIFFERENCE
-"""Difference of colours below which somebody who returns is the same person."""
-_SOON = 5.0
-"""s after which somebody whose clothes are not seen is somebody else."""
-_KEPT = 45
-"""Detections of a track that are remembered."""
-_COCO = np.array([0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11])
+_MIN_START_SCORE, _MIN_SCORE = 0.22, 0.12
+"""Least score of a detection that begins a track, and of one that continues it."""
+_MAX_PEOPLE = 4
+"""Largest number of tracked people; the largest ones in the image are kept."""
+_MIN_PRESENCE = 0.5
+_MIN_TRACK_S = 0.2
+"""Least duration of the track of a person, s."""
+_MAX_CLOTHES_DIFFERENCE = 0.6 * MAX_COLOUR_DIFFERENCE
+"""Largest difference of colours of a person who returns."""
+_MAX_ABSENCE_S = 5.0
+"""Longest absence after which a person whose clothes are not visible is recognised,
+s."""
+_MAX_DETECTIONS = 45
+"""Number of detections of a track that are kept."""
+_BODY25_OF_COCO = np.array([0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11])
 """BODY_25's keypoint of each of COCO's."""
 
 
 @dataclasses.dataclass
 class _Person:
-    """Somebody who has a number."""
+    """A person with a number."""
 
     track: int
     look: np.ndarray
 
 
 class LivePeople:
-    """Tracks of people, and the numbers of persons."""
+    """Tracks of people, and the numbers of the people."""
 
     def __init__(
         self,
@@ -75,17 +77,18 @@ class LivePeople:
     def find(
         self, image: UInt8[np.ndarray, "y x 3"]
     ) -> dict[int, Float[np.ndarray, "25 3"]]:
-        """BODY_25 keypoints (u px, v px, confidence) in the next image, by person."""
+        """Returns BODY_25 keypoints (u px, v px, confidence) in the next image, by
+        person."""
         self.load_networks()
         assert self.networks is not None
         alive = self.tracker.alive(self.frame)
         expected = [t.expected(self.frame, self.fps) for t in alive]
-        squares = regions(expected, self.settings.min_height, _MOST)
-        found = [self._look(image, r, _SQUARE) for r in squares]
+        squares = regions(expected, self.settings.min_height, _MAX_PEOPLE)
+        found = [self._look(image, r, _SQUARE_SIDE_PX) for r in squares]
         if self.frame >= self.next_search:
             whole = 0, 0, image.shape[1], image.shape[0]
-            found.append(self._look(image, whole, _SEARCH))
-            wait = _SELDOM if squares else _INTERVAL
+            found.append(self._look(image, whole, _IMAGE_SIDE_PX))
+            wait = _SEARCH_INTERVAL_TRACKED_S if squares else _SEARCH_INTERVAL_S
             self.next_search = self.frame + max(1, round(wait * self.fps))
         points = np.concatenate([np.zeros((0, 17, 3)), *(p for p, _ in found)])
         score = np.concatenate([np.zeros(0), *(s for _, s in found)])
@@ -96,7 +99,7 @@ class LivePeople:
         looks = [describe(image, p, MIN_SURE_SCORE) for p in points]
         looks = np.array(looks).reshape(-1, DESCRIPTOR_SIZE)
         clear = ~behind(points, score)
-        who = self._track(points, looks, clear, clear & (score >= _START))
+        who = self._track(points, looks, clear, clear & (score >= _MIN_START_SCORE))
         return {person: self._whole(image, points[row]) for row, person in who.items()}
 
     def given(
@@ -104,8 +107,8 @@ class LivePeople:
         keypoints: Float[np.ndarray, "p 25 3"],
         image: UInt8[np.ndarray, "y x 3"] | None = None,
     ) -> dict[int, Float[np.ndarray, "25 3"]]:
-        """Keypoints of the next frame in any order, by person."""
-        points = keypoints[:, _COCO]
+        """Returns keypoints of the next frame, given in any order, by person."""
+        points = keypoints[:, _BODY25_OF_COCO]
         some = np.array([sure_points(p).sum() >= 3 for p in points], bool)
         rows = np.flatnonzero(some)
         looks = np.full((len(rows), DESCRIPTOR_SIZE), np.nan)
@@ -121,13 +124,13 @@ class LivePeople:
     ) -> tuple[np.ndarray, np.ndarray]:
         assert self.networks is not None
         points, score = movenet.find_people(self.networks[0], image, region, longer)
-        kept = score >= _CONTINUE
+        kept = score >= _MIN_SCORE
         return points[kept], score[kept]
 
     def _whole(
         self, image: np.ndarray, points: Float[np.ndarray, "17 3"]
     ) -> Float[np.ndarray, "25 3"]:
-        """BODY_25 with the feet that BlazePose sees."""
+        """Returns BODY_25, with the feet that BlazePose finds."""
         assert self.networks is not None
         square = blazepose.turned_square(points, MIN_SURE_SCORE)
         if square is None:
@@ -135,7 +138,7 @@ class LivePeople:
         pose = blazepose.read_pose(self.networks[1], image, square)
         apart = blazepose.disagreement(pose, points)
         if (
-            pose.presence < _PRESENCE
+            pose.presence < _MIN_PRESENCE
             or np.median(apart[sure_points(points)]) > MAX_DISAGREEMENT
         ):
             return as_body25(points, None)
@@ -148,11 +151,11 @@ class LivePeople:
         may_return: np.ndarray,
         may_start: np.ndarray,
     ) -> dict[int, int]:
-        """The person of each row, of those that are one."""
+        """Returns the person of each row that shows one."""
         who = self.tracker.update(self.frame, points, looks, may_return, may_start)
         for track in self.tracker.tracklets:
             for kept in (track.frames, track.points, track.looks):
-                del kept[:-_KEPT]
+                del kept[:-_MAX_DETECTIONS]
         self.frame += 1
         found = {}
         for row, number in enumerate(who.tolist()):
@@ -167,7 +170,7 @@ class LivePeople:
                 known.look = self.tracker.tracklets[number].look
                 return person
         track = self.tracker.tracklets[number]
-        if len(track.frames) < max(2, round(_LASTS * self.fps)):
+        if len(track.frames) < max(2, round(_MIN_TRACK_S * self.fps)):
             return None
         look, person = track.look, len(self.persons)
         away = [
@@ -175,19 +178,20 @@ class LivePeople:
             for other, known in self.persons.items()
             if self._last(other) < track.frames[0]
         ]
-        # Without an image, who comes soon after only one person went is that one.
+        # Without an image, one who comes soon after only one left is that person.
         lately = [
             (0.0, other)
             for d, other in away
-            if np.isnan(d) and self.frame - self._last(other) <= _SOON * self.fps
+            if np.isnan(d)
+            and self.frame - self._last(other) <= _MAX_ABSENCE_S * self.fps
         ]
         away = lately if len(lately) == 1 else away
-        away = [(d, other) for d, other in away if d < _SAME_CLOTHES]
+        away = [(d, other) for d, other in away if d < _MAX_CLOTHES_DIFFERENCE]
         if away:
             person = min(away)[1]
         self.persons[person] = _Person(number, look)
         return person
 
     def _last(self, person: int) -> int:
-        """The frame in which a person was seen last."""
+        """Returns the frame in which a person was visible last."""
         return self.tracker.tracklets[self.persons[person].track].frames[-1]

@@ -1,10 +1,10 @@
-"""Frame after frame: the camera's pose on a map of points that grows with the video.
+"""Locates the camera of a running video on a map of points that grows with the video.
 
-Two views with enough parallax begin a map; every other camera comes from points that
-are tracked and known; points are triangulated from keyframes. A camera that fits no map
-is lost: it is found again by descriptors of keyframes, or a new map begins. The unit of
-a map is arbitrary. Poses and points are refined elsewhere (`online.window`) and handed
-back (`corrected`).
+Two views with enough parallax begin a map; every other camera is resected from tracked
+points with a known position; points are triangulated from keyframes. A camera that does
+not fit the map is lost: it is relocalised by descriptors of keyframes, or a new map
+begins. The unit of a map is arbitrary. Poses and points are refined elsewhere
+(`online.window`) and returned (`corrected`).
 """
 
 import dataclasses
@@ -19,43 +19,43 @@ from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.multiview import relative_pose, resect
 from bodyslam_jax.types import Intrinsics
 
-_THRESHOLD = 3.0
+_MAX_ERROR_PX = 3.0
 """Reprojection error of an inlier, px at 640x480."""
-_LEAST = 12
-"""Points by which a camera is located."""
-_SHARE = 0.3
-"""Share of the known points that must agree."""
-_FIRST_ANGLE = np.radians(1.5)
-"""Median parallax from which two views begin a map."""
-_FIRST_POINTS = 40
-_FIRST_SHARE = 0.7
-"""Share of the tracks that two views must explain."""
-_WAIT = 240
-"""Frames that are kept while two views are looked for."""
-_EVERY, _LEFT = 5, 0.7
-"""A keyframe is every so many frames, and where less of the last one's points are
-left."""
-_KEYFRAMES = 12
-"""Keyframes from which points are triangulated."""
-_ANGLE = np.radians(1.0)
-"""Parallax of a new point."""
-_ENOUGH, _LEAST_ANGLE = 0.5, 0.2
+_MIN_INLIERS = 12
+"""Least number of inliers with which a camera is located."""
+_MIN_INLIER_SHARE = 0.3
+"""Least share of inliers among the known points."""
+_MIN_FIRST_PARALLAX_RAD = np.radians(1.5)
+"""Least median parallax of two views that begin a map, rad."""
+_MIN_FIRST_POINTS = 40
+_MIN_FIRST_INLIER_SHARE = 0.7
+"""Least share of inliers of two views that begin a map."""
+_MAX_WAITING_FRAMES = 240
+"""Number of frames that are kept until two views begin a map."""
+_KEYFRAME_INTERVAL, _MIN_COMMON_SHARE = 5, 0.7
+"""Largest number of frames between keyframes; share of the last keyframe's points below
+which there is a new one."""
+_NUM_KEYFRAMES = 12
+"""Number of keyframes from which points are triangulated."""
+_MIN_PARALLAX_RAD = np.radians(1.0)
+"""Least parallax of a new point, rad."""
+_FULL_PARALLAX_SHARE, _MIN_PARALLAX_FACTOR = 0.5, 0.2
 """Share of known points from which new ones need all of that parallax, and the least
-share of it."""
-_OFF = 0.25
-"""Share of views that a new point may not fit: tracks have outliers."""
-_ROTATED = 2.0
-"""px: median distance from a pure turn up to which two views have no parallax."""
+share of it that they need."""
+_MAX_OUTLIER_SHARE = 0.25
+"""Largest share of outliers among the views of a new point: tracks have outliers."""
+_MAX_ROTATION_ERROR_PX = 2.0
+"""Largest median distance from a pure rotation of two views without parallax, px."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Keyframe:
-    """A located frame."""
+    """A located frame from which points are triangulated."""
 
     T_WC: Float[np.ndarray, "4 4"]
     ids: Int[np.ndarray, " n"]
     xy: Float[np.ndarray, "n 2"]
-    """At depth 1."""
+    """Positions on the plane at depth 1."""
 
 
 class LiveMap:
@@ -64,10 +64,10 @@ class LiveMap:
     def __init__(self, intrinsics: Intrinsics) -> None:
         self.K, self.distortion = as_opencv(intrinsics.params)
         size = max(intrinsics.width, intrinsics.height) / 640
-        self.threshold = _THRESHOLD * max(size, 1.0) / float(self.K[0, 0])
+        self.threshold = _MAX_ERROR_PX * max(size, 1.0) / float(self.K[0, 0])
         self.points: dict[int, Float[np.ndarray, " 3"]] = {}
-        self.keyframes: deque[Keyframe] = deque(maxlen=_KEYFRAMES)
-        self.waiting: deque[Keyframe] = deque(maxlen=_WAIT)
+        self.keyframes: deque[Keyframe] = deque(maxlen=_NUM_KEYFRAMES)
+        self.waiting: deque[Keyframe] = deque(maxlen=_MAX_WAITING_FRAMES)
         self.T_WC = np.eye(4)
         self.step = np.eye(4)
         """The last motion, from camera to camera."""
@@ -81,7 +81,7 @@ class LiveMap:
     def begin(
         self, ids: Int[np.ndarray, " n"], uv: Float[np.ndarray, "n 2"]
     ) -> list[Float[np.ndarray, "4 4"] | None] | None:
-        """Takes a frame in and tries to begin a map with it and an earlier one.
+        """Adds a frame and tries to begin a map with it and an earlier one.
 
         **Returns:** poses of all frames that were taken in, the newest last, `None` for
         those that do not fit; `None` as long as there is no map.
@@ -108,7 +108,8 @@ class LiveMap:
     def locate(
         self, ids: Int[np.ndarray, " n"], uv: Float[np.ndarray, "n 2"]
     ) -> Float[np.ndarray, "4 4"] | None:
-        """The pose of the next frame, `None` if it fits the map nowhere near."""
+        """Returns the pose of the next frame; `None` if it does not fit the map near
+        the last pose."""
         xy = self._normalised(uv)
         found = self._locate(ids, xy, self.T_WC @ self.step)
         if found is None:
@@ -119,7 +120,7 @@ class LiveMap:
         self.since += 1
         last = self.keyframes[-1].ids if self.keyframes else ids[:0]
         left = np.isin(last, ids).mean() if len(last) else 0.0
-        if self.since >= _EVERY or left < _LEFT:
+        if self.since >= _KEYFRAME_INTERVAL or left < _MIN_COMMON_SHARE:
             self._remember(found, ids, xy)
             self.since = 0
         return found
@@ -129,9 +130,12 @@ class LiveMap:
         points: Float[np.ndarray, "n 3"],
         uv: Float[np.ndarray, "n 2"],
     ) -> Float[np.ndarray, "4 4"] | None:
-        """The pose of a frame that shows known points, wherever it is."""
+        """Returns the pose of a frame that shows known points, without a guess; `None`
+        if too few fit."""
         found = resect(points, self._normalised(uv), self.threshold)
-        if found is None or found[2].sum() < max(_LEAST, _SHARE * len(points)):
+        if found is None or found[2].sum() < max(
+            _MIN_INLIERS, _MIN_INLIER_SHARE * len(points)
+        ):
             return None
         self.T_WC, self.step = _pose(found[0], found[1]), np.eye(4)
         return self.T_WC
@@ -141,17 +145,17 @@ class LiveMap:
         move: Float[np.ndarray, "4 4"],
         points: dict[int, Float[np.ndarray, " 3"]],
     ) -> None:
-        """Moves the map as a whole; `points` are where they were found to be then."""
+        """Moves the map as a whole, and sets `points` to their refined positions in the
+        moved map."""
         turn, shift = move[:3, :3], move[:3, 3]
         self.points = {i: turn @ x + shift for i, x in self.points.items()}
         self.points.update(points)
         self.T_WC = move @ self.T_WC
         moved = [dataclasses.replace(k, T_WC=move @ k.T_WC) for k in self.keyframes]
-        self.keyframes = deque(moved, maxlen=_KEYFRAMES)
+        self.keyframes = deque(moved, maxlen=_NUM_KEYFRAMES)
 
     def forget(self, kept: Int[np.ndarray, " n"]) -> None:
-        """Drops all points but these, which somebody still needs, and those of
-        keyframes."""
+        """Removes all points but these and those of keyframes."""
         here = set(kept.tolist()).union(*(k.ids.tolist() for k in self.keyframes))
         self.points = {i: x for i, x in self.points.items() if i in here}
 
@@ -160,19 +164,19 @@ class LiveMap:
 
     def _two_views(self, a: Keyframe, b: Keyframe) -> bool:
         _, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
-        if len(i) < _FIRST_POINTS:
+        if len(i) < _MIN_FIRST_POINTS:
             return False
         xy_a, xy_b = a.xy[i], b.xy[j]
-        pixel = self.threshold / _THRESHOLD
+        pixel = self.threshold / _MAX_ERROR_PX
         if np.median(np.linalg.norm(xy_a - xy_b, axis=1)) < 5 * pixel:
             return False
         found = relative_pose(xy_a, xy_b, pixel)
-        if found is None or found[2].mean() < _FIRST_SHARE:
+        if found is None or found[2].mean() < _MIN_FIRST_INLIER_SHARE:
             return False
         R, t, good = found
         turned = np.column_stack([xy_a, np.ones(len(xy_a))]) @ R.T
         away = np.linalg.norm(turned[:, :2] / turned[:, 2:] - xy_b, axis=1)
-        if np.median(away) < _ROTATED * pixel:
+        if np.median(away) < _MAX_ROTATION_ERROR_PX * pixel:
             return False
         R_CW = np.stack([np.eye(3), R])
         centre = np.stack([np.zeros(3), -R.T @ t])
@@ -185,11 +189,14 @@ class LiveMap:
         angle = widest_angle(given[1], which, places)
         front = (places @ R_CW[1].T - R_CW[1] @ centre[1])[:, 2] > 0
         front &= places[:, 2] > 0
-        if front.sum() < _FIRST_POINTS or np.median(angle[front]) < _FIRST_ANGLE:
+        if (
+            front.sum() < _MIN_FIRST_POINTS
+            or np.median(angle[front]) < _MIN_FIRST_PARALLAX_RAD
+        ):
             return False
         unit = float(np.median(places[front, 2]))
         ids = a.ids[i][rows]
-        sure = front & (angle > _ANGLE / 2)
+        sure = front & (angle > _MIN_PARALLAX_RAD / 2)
         self.points = {int(n): x / unit for n, x in zip(ids[sure], places[sure])}
         return True
 
@@ -200,12 +207,14 @@ class LiveMap:
         guess: Float[np.ndarray, "4 4"] | None,
     ) -> Float[np.ndarray, "4 4"] | None:
         known = np.array([i in self.points for i in ids.tolist()], bool)
-        if known.sum() < _LEAST:
+        if known.sum() < _MIN_INLIERS:
             return None
         points = np.array([self.points[i] for i in ids[known].tolist()])
         start = None if guess is None else (guess[:3, :3].T, guess[:3, 3])
         found = resect(points, xy[known], self.threshold, start)
-        if found is None or found[2].sum() < max(_LEAST, _SHARE * known.sum()):
+        if found is None or found[2].sum() < max(
+            _MIN_INLIERS, _MIN_INLIER_SHARE * known.sum()
+        ):
             return None
         for i in ids[known][~found[2]].tolist():
             # A point that moved, or was triangulated from a wrong match.
@@ -218,7 +227,7 @@ class LiveMap:
         ids: Int[np.ndarray, " n"],
         xy: Float[np.ndarray, "n 2"],
     ) -> None:
-        """Adds a keyframe, and the points that it and earlier ones show."""
+        """Adds a keyframe, and triangulates new points from it and earlier ones."""
         self.keyframes.append(Keyframe(pose, ids, xy))
         new = ids[[i not in self.points for i in ids.tolist()]]
         if not len(new):
@@ -232,7 +241,7 @@ class LiveMap:
         T_WC = np.concatenate([np.repeat(v[0][None], len(v[1]), 0) for v in views])
         track, row, count = np.unique(number, return_inverse=True, return_counts=True)
         R_CW, centre = np.swapaxes(T_WC[:, :3, :3], 1, 2), T_WC[:, :3, 3]
-        scale = self.threshold / _THRESHOLD
+        scale = self.threshold / _MAX_ERROR_PX
         places = triangulate(R_CW, centre, seen, row, len(track), scale)
         p_C = np.einsum("mij,mj->mi", R_CW, places[row] - centre)
         front = p_C[:, 2] > 1e-6
@@ -241,9 +250,9 @@ class LiveMap:
         fits = front & (away < self.threshold)
         off = np.bincount(row, ~fits, len(track)) / count
         # Where the camera mostly turns, points of little parallax are better than none.
-        share = (len(ids) - len(new)) / (_ENOUGH * len(ids))
-        angle = _ANGLE * np.clip(share, _LEAST_ANGLE, 1.0)
-        good = (count >= 2) & (off < _OFF)
+        share = (len(ids) - len(new)) / (_FULL_PARALLAX_SHARE * len(ids))
+        angle = _MIN_PARALLAX_RAD * np.clip(share, _MIN_PARALLAX_FACTOR, 1.0)
+        good = (count >= 2) & (off < _MAX_OUTLIER_SHARE)
         good &= widest_angle(centre, row, places) > angle
         for i, x in zip(track[good].tolist(), places[good]):
             self.points[i] = x

@@ -1,4 +1,4 @@
-"""Points followed from frame to frame, and places recognised, as a video runs.
+"""Tracks points from frame to frame of a running video, and recognises places.
 
 Corners (Shi and Tomasi, 1994) spread over the image are followed by pyramidal
 Lucas--Kanade there and back. ORB (Rublee et al., 2011) describes keyframes, so that a
@@ -17,47 +17,48 @@ from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.features import epipolar_inliers, match, spread
 from bodyslam_jax.types import Intrinsics
 
-_ROUND_TRIP = 0.5
+_MAX_ROUND_TRIP_PX = 0.5
 """Largest forward-backward error, px, as offline (`tracks`)."""
-_WINDOW = 21
-_CELLS = 8
-"""Cells along the longer side of the image, over which points are spread."""
-_SPARSE = 0.85
-"""Share of the wanted points below which new ones are looked for."""
-_BORDER = 4
-_GAP = 10
-"""Frames over which points must fit one rigid motion."""
-_EPIPOLAR = 1.5
-"""Distance from the epipolar line beyond which a point is dropped, px."""
-_STILL = 3.0
-"""Median motion over these frames, px, below which the test says nothing."""
-_PLACES = 60
-"""Keyframes that are remembered: two minutes at one in two seconds."""
-_FEATURES = 1000
-_NEAR = 3.0
-"""Distance of a corner that describes a point, px."""
-_MATCHES = 20
-"""Matches by which a place is recognised."""
-_DARK = 8.0
-"""Standard deviation of grey levels below which an image shows nothing."""
+_WINDOW_PX = 21
+_NUM_CELLS = 8
+"""Number of cells along the longer side of the image, over which points are spread."""
+_MIN_TRACKED_SHARE = 0.85
+"""Share of the wanted number of points below which new ones are detected."""
+_BORDER_PX = 4
+_RIGID_FRAMES = 10
+"""Number of frames over which points must fit one rigid motion."""
+_MAX_EPIPOLAR_PX = 1.5
+"""Largest distance of a point from its epipolar line, px."""
+_MIN_MOTION_PX = 3.0
+"""Median motion over these frames, px, below which the epipolar test is not
+informative."""
+_MAX_PLACES = 60
+"""Number of keyframes that are kept: two minutes at one in two seconds."""
+_NUM_FEATURES = 1000
+_MAX_CORNER_DISTANCE_PX = 3.0
+"""Largest distance of a tracked point from the corner that describes it, px."""
+_MIN_MATCHES = 20
+"""Least number of matches of a recognised place."""
+_MIN_CONTRAST = 8.0
+"""Standard deviation of grey levels below which an image has no features."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """What a keyframe looked like, and where its points are."""
+    """The descriptors of a keyframe, and the positions of its points."""
 
     descriptors: UInt8[np.ndarray, "n 32"]
     points: Float[np.ndarray, "n 3"]
     """Map units."""
 
     def moved(self, move: Float[np.ndarray, "4 4"]) -> "Place":
-        """The place after the map was moved as a whole."""
+        """Returns the place after a transform of the whole map."""
         points = self.points @ move[:3, :3].T + move[:3, 3]
         return dataclasses.replace(self, points=points)
 
 
 class PointFollower:
-    """Points that are followed, and the last image."""
+    """The points that are tracked, and the last image."""
 
     def __init__(self, intrinsics: Intrinsics, wanted: int) -> None:
         self.size = intrinsics.width, intrinsics.height
@@ -66,28 +67,32 @@ class PointFollower:
         self.ids, self.uv = np.zeros(0, np.int64), np.zeros((0, 2))
         self.step = np.zeros((0, 2))
         self.previous: np.ndarray | None = None
-        self.recent: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=_GAP + 1)
+        self.recent: deque[tuple[np.ndarray, np.ndarray]] = deque(
+            maxlen=_RIGID_FRAMES + 1
+        )
         self.next_id = 0
-        self.orb = cv2.ORB.create(_FEATURES)
-        self.places: deque[Place] = deque(maxlen=_PLACES)
+        self.orb = cv2.ORB.create(_NUM_FEATURES)
+        self.places: deque[Place] = deque(maxlen=_MAX_PLACES)
 
     def advance(
         self, gray: UInt8[np.ndarray, "y x"], mask: UInt8[np.ndarray, "y x"] | None
     ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
-        """Follows the points to the next image; `mask` is not 0 where people are."""
-        if gray.std() < _DARK:  # Nothing to see; what comes next is compared with it.
+        """Tracks the points to the next image; `mask` is not 0 where people are."""
+        if (
+            gray.std() < _MIN_CONTRAST
+        ):  # Nothing to see; what comes next is compared with it.
             self._keep(np.zeros(len(self.ids), bool))
         if self.previous is not None and len(self.ids):
             self._follow(gray, mask)
             self._drop_moving()
-        if len(self.ids) < _SPARSE * self.wanted:
+        if len(self.ids) < _MIN_TRACKED_SHARE * self.wanted:
             self._refill(gray, mask)
         self.previous = gray
         self.recent.append((self.ids, self.uv))
         return self.ids, self.uv
 
     def add(self, uv: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, " n"]:
-        """Follows more points of the last image from now on; returns their numbers."""
+        """Adds points of the last image to be tracked; returns their numbers."""
         ids = np.arange(self.next_id, self.next_id + len(uv))
         self.next_id += len(uv)
         self.ids = np.concatenate([self.ids, ids])
@@ -96,9 +101,10 @@ class PointFollower:
         return ids
 
     def remember(self, points: dict[int, Float[np.ndarray, " 3"]]) -> None:
-        """Remembers the last image as a place, by its points that are known."""
+        """Adds the last image as a place, with its points that have a known
+        position."""
         known = np.array([i in points for i in self.ids.tolist()], bool)
-        if known.sum() < _MATCHES or self.previous is None:
+        if known.sum() < _MIN_MATCHES or self.previous is None:
             return
         marks, descriptors = self.orb.detectAndCompute(self.previous, None)
         if descriptors is None:
@@ -106,10 +112,10 @@ class PointFollower:
         # Described are ORB's own corners, turned as it sees them, next to known points.
         ids, uv = self.ids[known], self.uv[known]
         corners = np.array([mark.pt for mark in marks])
-        found = KDTree(uv).query(corners, distance_upper_bound=_NEAR)
+        found = KDTree(uv).query(corners, distance_upper_bound=_MAX_CORNER_DISTANCE_PX)
         away, near = (np.asarray(x) for x in found)
         rows = np.flatnonzero(np.isfinite(away))
-        if len(rows) < _MATCHES:
+        if len(rows) < _MIN_MATCHES:
             return
         where = np.array([points[i] for i in ids[near[rows]].tolist()])
         self.places.append(Place(descriptors[rows], where))
@@ -117,15 +123,18 @@ class PointFollower:
     def recognise(
         self, gray: UInt8[np.ndarray, "y x"]
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]] | None:
-        """Points of the place that this image shows most likely, and their pixels."""
+        """Returns the points of the place with the most matches, and their pixels in
+        the image."""
         found, descriptors = self.orb.detectAndCompute(gray, None)
-        if descriptors is None or len(found) < _MATCHES:
+        if descriptors is None or len(found) < _MIN_MATCHES:
             return None
         uv = np.array([p.pt for p in found])
         best = None
         for place in reversed(self.places):
             pairs = match(place.descriptors, descriptors)
-            if len(pairs) >= _MATCHES and (best is None or len(pairs) > len(best[0])):
+            if len(pairs) >= _MIN_MATCHES and (
+                best is None or len(pairs) > len(best[0])
+            ):
                 best = place.points[pairs[:, 0]], uv[pairs[:, 1]]
         return best
 
@@ -137,29 +146,29 @@ class PointFollower:
         assert self.previous is not None
         uv, ok = _flow(self.previous, gray, self.uv, self.uv + self.step)
         back, ok_back = _flow(gray, self.previous, uv, self.uv)
-        ok &= ok_back & (np.linalg.norm(back - self.uv, axis=1) < _ROUND_TRIP)
+        ok &= ok_back & (np.linalg.norm(back - self.uv, axis=1) < _MAX_ROUND_TRIP_PX)
         ok &= self._inside(uv, mask)
         self.step, self.uv = uv - self.uv, uv
         self._keep(ok)
 
     def _drop_moving(self) -> None:
-        """Drops what does not fit one rigid motion over the last frames."""
+        """Drops points that do not fit one rigid motion over the last frames."""
         if not self.recent:
             return
         ids, uv = self.recent[0]
         _, now, then = np.intersect1d(self.ids, ids, return_indices=True)
         moved = np.linalg.norm(self.uv[now] - uv[then], axis=1)
-        if not len(now) or np.median(moved) < _STILL:
+        if not len(now) or np.median(moved) < _MIN_MOTION_PX:
             return
         a, b = (rays(x, self.K, self.distortion) for x in (uv[then], self.uv[now]))
-        inlier = epipolar_inliers(a, b, _EPIPOLAR / self.K[0, 0])
+        inlier = epipolar_inliers(a, b, _MAX_EPIPOLAR_PX / self.K[0, 0])
         kept = np.ones(len(self.ids), bool)
         kept[now[~inlier]] = False
         self._keep(kept)
 
     def _inside(self, uv: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
         width, height = self.size
-        low, high = _BORDER, np.array([width, height]) - _BORDER
+        low, high = _BORDER_PX, np.array([width, height]) - _BORDER_PX
         ok = np.array(np.logical_and(uv >= low, uv < high).all(axis=1))
         if mask is not None:
             at = np.clip(np.rint(uv), 0, [width - 1, height - 1]).astype(int)
@@ -175,7 +184,7 @@ class PointFollower:
         uv = uv[self._inside(uv, mask)]
         if not len(uv):
             return
-        cell = -(-max(self.size) // _CELLS)
+        cell = -(-max(self.size) // _NUM_CELLS)
         occupied = np.unique((uv // cell).astype(int), axis=0)
         quota = -(-self.wanted // max(len(occupied), 1))
         chosen = spread(
@@ -198,7 +207,7 @@ def _flow(
         b,
         uv.astype(np.float32).reshape(-1, 1, 2),
         guess.astype(np.float32).reshape(-1, 1, 2),
-        winSize=(_WINDOW, _WINDOW),
+        winSize=(_WINDOW_PX, _WINDOW_PX),
         maxLevel=3,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
