@@ -27,7 +27,7 @@ from bodyslam_jax.pipeline.motion_prediction import (
     motion_predictor,
     predict,
 )
-from bodyslam_jax.solver.marginalisation import in_frames
+from bodyslam_jax.solver.subproblem import in_frames
 from bodyslam_jax.types import Keypoints, ScaleStart, Sequence, Tracks
 
 log = logging.getLogger(__name__)

@@ -1,9 +1,9 @@
 """Marginalises the first chunks of a problem into a prior on the remaining ones.
 
-The measurements are split: `old` are those of the first frames and of all landmarks
-that these frames observe, `rest` are the others. With the normal equations `H δ = -g`
-of `old` at a state, E the variables that only `old` depends on, and R all others that
-it depends on,
+The measurements are split (`subproblem`): `old` are those of the first frames and of
+all landmarks that these frames observe, `rest` are the others. With the normal
+equations `H δ = -g` of `old` at a state, E the variables that only `old` depends on,
+and R all others that it depends on,
 
     Λ = H_RR - H_RE H_EE^-1 H_ER,    η = g_R - H_RE H_EE^-1 g_E.
 
@@ -24,7 +24,7 @@ it as a factor of the remaining state.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -33,21 +33,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.geometry.lengths import put
 from bodyslam_jax.graph import (
     CHUNK,
-    Factor,
-    FrameFactor,
-    LandmarkPrior,
     MarginalPrior,
     Problem,
-    Reprojection,
     State,
     layout_of,
-    make_layout,
     residual_of,
 )
-from bodyslam_jax.graph.padding import Masked
 from bodyslam_jax.solver.block_cholesky import Factor as Factorised
 from bodyslam_jax.solver.block_cholesky import factorise
 from bodyslam_jax.solver.blocks import CAMERAS, Sizes, mask_of, sizes_of
@@ -62,6 +55,13 @@ from bodyslam_jax.solver.padding import pad
 from bodyslam_jax.solver.posture import basis_of
 from bodyslam_jax.solver.reduced_system import Chunks
 from bodyslam_jax.solver.solve import check_start
+from bodyslam_jax.solver.subproblem import (
+    marginalised_part,
+    observed_landmarks,
+    reach_of,
+    remaining_part,
+    restricted,
+)
 
 _ELIMINATION_DAMPING_EPS = 64
 """Damping of eliminated variables, in units of the machine epsilon: pivots of points
@@ -114,222 +114,23 @@ def marginalise(problem: Problem, state: State, frames: int) -> Remainder:
             f"{total - 1}."
         )
     problem = problem.refresh(state)
-    observed, last = _observed_landmarks(problem, frames)
+    observed, last = observed_landmarks(problem, frames)
     first = frames // CHUNK - 1
-    old, start = _old(problem, state, frames, observed, last)
+    old, start = marginalised_part(problem, state, frames, observed, last)
     count = -(-len(start.cameras) // CHUNK) - first
     padded = pad(old, start)
     found = _program()(*padded, jnp.asarray(first, jnp.int32), count)
     invariant = _invariant(*padded)
-    rest = _rest(problem, state, frames, observed, found.window.reach)
+    rest, rest_state, landmarks = remaining_part(
+        problem, state, frames, observed, found.window.reach
+    )
     free = np.asarray(problem.free.poses)[:, frames - 1].reshape(-1, 69, 1)
     postures = free * np.asarray(basis_of(problem, state.scale.dtype))
-    prior = _prior(problem, old, rest.state, found, count, invariant, postures)
-    left = (*rest.problem.factors, prior)
-    shape = {name: len(x) for name, x in (("t", rest.state.cameras),)}
-    shape |= {"l": len(rest.landmarks), "h": len(state.roots)}
-    whole = dataclasses.replace(
-        rest.problem, factors=left, layout=layout_of(left, shape, None)
-    )
-    return rest._replace(problem=whole)
-
-
-# The measurements of the first frames, and the others.
-
-
-def _observed_landmarks(
-    problem: Problem, frames: int
-) -> tuple[Bool[np.ndarray, " l"], int]:
-    """Returns which landmarks are observed in the first frames, and the number of
-    frames up to the last that the marginalised measurements depend on."""
-    observed = np.zeros(len(problem.free.landmarks), bool)
-    last = frames
-    for factor in problem.factors:
-        if isinstance(factor, Reprojection):
-            frame, landmark = np.asarray(factor.frame), np.asarray(factor.landmark)
-            counts = np.isfinite(np.asarray(factor.sigma))
-            observed[landmark[(frame < frames) & counts]] = True
-            here = observed[landmark] & counts
-            last = max(last, 1 + frame.max(initial=0, where=here))
-        if isinstance(factor, MarginalPrior):
-            last = max(last, factor.frames)
-    return observed, int(last)
-
-
-def _reach(problem: Problem) -> int:
-    """Returns the number of frames that factors reach back.
-
-    **Raises:** `ValueError` if that is a chunk or more.
-    """
-    lags = [f.num_lags - 1 for f in problem.factors if isinstance(f, FrameFactor)]
-    reach = max(lags, default=0)
-    if reach >= CHUNK:
-        raise ValueError(
-            f"problem.factors: one reaches back {reach} frames, expected at most "
-            f"{CHUNK - 1}."
-        )
-    return reach
-
-
-def _old(
-    problem: Problem,
-    state: State,
-    frames: int,
-    observed: Bool[np.ndarray, " l"],
-    last: int,
-) -> tuple[Problem, State]:
-    """Returns the problem and state of the marginalised measurements, with the frames
-    and landmarks that they depend on."""
-    present = np.arange(last) < frames
-    chosen = [f for f in problem.factors if not _is_once(f)]
-    factors = tuple(_part(f, 0, last, present, observed) for f in chosen)
-    tracks = next((f for f in factors if isinstance(f, Reprojection)), None)
-    none = np.zeros(0, int)
-    before = [f.frames for f in factors if isinstance(f, MarginalPrior)]
-    layout = make_layout(
-        last,
-        int(observed.sum()),
-        none if tracks is None else np.asarray(tracks.frame),
-        none if tracks is None else np.asarray(tracks.landmark),
-        len(state.roots),
-        front=-(-max(before, default=1) // CHUNK),
-    )
-    old = dataclasses.replace(
-        problem,
-        factors=factors,
-        free=_cut(problem.free, 0, last, observed),
-        motion=None,
-        layout=layout,
-    )
-    return old, _cut(state, 0, last, observed)
-
-
-def _rest(
-    problem: Problem,
-    state: State,
-    frames: int,
-    observed: Bool[np.ndarray, " l"],
-    roots: int,
-) -> Remainder:
-    """Returns the remaining problem, without the prior and the layout for it."""
-    start, stop = frames - CHUNK, len(state.cameras)
-    present = np.arange(start, stop) >= frames
-    factors = tuple(
-        _part(f, start, stop, present, ~observed)
-        for f in problem.factors
-        if not isinstance(f, MarginalPrior)
-    )
-    free = _cut(problem.free, start, stop, ~observed)
-    cameras = _reach(problem)
-    until = lambda x, axis, count: jnp.asarray(
-        np.asarray(x) * _from(count, np.shape(x), axis), x.dtype
-    )
-    free = dataclasses.replace(
-        free,
-        cameras=until(free.cameras, 0, CHUNK - cameras),
-        roots=until(free.roots, 1, CHUNK - roots),
-        poses=until(free.poses, 1, CHUNK - 1),
-    )
-    motion = None if problem.motion is None else problem.motion.from_frame(start)
-    left = dataclasses.replace(problem, factors=factors, free=free, motion=motion)
-    there = _cut(state, start, stop, ~observed)
-    return Remainder(left, there, np.flatnonzero(~observed))
-
-
-def _from(start: int, shape: tuple[int, ...], axis: int) -> np.ndarray:
-    """Returns 1 from an index of an axis on, else 0; broadcasts to this shape."""
-    along = [n if a == axis else 1 for a, n in enumerate(shape)]
-    return (np.arange(shape[axis]) >= start).astype(float).reshape(along)
-
-
-def _is_once(factor: Factor) -> bool:
-    return isinstance(factor, FrameFactor) and factor.once
-
-
-def _cut(x: Any, start: int, stop: int, landmarks: Bool[np.ndarray, " l"]) -> Any:
-    """Restricts a state, or a mask, to some frames and landmarks."""
-    return dataclasses.replace(
-        x,
-        cameras=_rows(x.cameras, slice(start, stop)),
-        roots=_rows(x.roots, (slice(None), slice(start, stop))),
-        poses=_rows(x.poses, (slice(None), slice(start, stop))),
-        landmarks=_rows(x.landmarks, np.flatnonzero(landmarks)),
-    )
-
-
-def _rows(x: Array, at: Any) -> Array:
-    """Returns `x[at]` by NumPy: JAX would compile a program for each shape."""
-    return put(np.asarray(x)[at])
-
-
-def _part(
-    factor: Factor,
-    start: int,
-    stop: int,
-    present: Bool[np.ndarray, " t"],
-    landmarks: Bool[np.ndarray, " l"],
-) -> Factor:
-    """Restricts a factor to some landmarks, or to the frames that are `present` among
-    those from `start` to `stop`."""
-    if isinstance(factor, Reprojection):
-        frame, landmark = np.asarray(factor.frame), np.asarray(factor.landmark)
-        rows = np.flatnonzero(landmarks[landmark] & (frame >= start) & (frame < stop))
-        number = np.cumsum(landmarks) - 1
-        return Reprojection(
-            frame=put(frame[rows] - start, factor.frame.dtype),
-            landmark=put(number[landmark[rows]], factor.landmark.dtype),
-            pixel=_rows(factor.pixel, rows),
-            sigma=_rows(factor.sigma, rows),
-            loss=factor.loss,
-        )
-    if isinstance(factor, LandmarkPrior):
-        kept = np.flatnonzero(landmarks)
-        of_kept = (_rows(x, kept) for x in (factor.position, factor.whitening))
-        return LandmarkPrior(*of_kept, loss=factor.loss)
-    if not isinstance(factor, FrameFactor) or factor.once:
-        return factor
-    return in_frames(_frames(factor, start, stop), present)
-
-
-def _frames(factor: FrameFactor, start: int, stop: int) -> FrameFactor:
-    """Returns the factor of the sequence from `start` to `stop`."""
-    axis = 1 if factor.of_people else 0
-    if isinstance(factor, Masked):
-        inner = _frames(factor.factor, start, stop)
-        present = _rows(factor.present, (..., slice(start, stop)))
-        return Masked(factor=inner, present=present)
-    lead = None
-    cut = lambda x: _rows(x, (slice(None),) * axis + (slice(start, stop),))
-    for name in factor.time_fields:
-        value = getattr(factor, name)
-        lead = value.shape[: axis + 1]
-        factor = eqx.tree_at(lambda f, n=name: getattr(f, n), factor, cut(value))
-    if lead and any(jnp.ndim(x) for x in jax.tree.leaves(factor.loss)):
-        of_frames = lambda x: cut(x) if jnp.shape(x)[: axis + 1] == lead else x
-        loss = jax.tree.map(of_frames, factor.loss)
-        factor = eqx.tree_at(lambda f: f.loss, factor, loss)
-    return factor
-
-
-def in_frames(factor: FrameFactor, present: Bool[np.ndarray, " t"]) -> FrameFactor:
-    """Returns the factor with the residuals of the `present` frames only."""
-    kept = np.asarray(present)
-    if isinstance(factor, Masked):
-        both = np.asarray(factor.present) & kept
-        return Masked(factor=factor.factor, present=jnp.asarray(both))
-    if not factor.padding or factor.num_lags > 1:
-        # A row may use the measurement of the row before it, which must therefore stay.
-        values = getattr(factor, factor.time_fields[0])
-        lead = values.shape[: 2 if factor.of_people else 1]
-        return Masked(factor=factor, present=jnp.asarray(np.broadcast_to(kept, lead)))
-    axis = 1 if factor.of_people else 0
-    for name, fill in factor.padding.items():
-        array = np.asarray(getattr(factor, name))
-        shape = [len(kept) if a == axis else 1 for a in range(array.ndim)]
-        empty = np.asarray(fill, array.dtype)
-        filled = jnp.asarray(np.where(kept.reshape(shape), array, empty))
-        factor = eqx.tree_at(lambda f, n=name: getattr(f, n), factor, filled)
-    return factor
+    prior = _prior(problem, old, rest_state, found, count, invariant, postures)
+    left = (*rest.factors, prior)
+    shape = {"t": len(rest_state.cameras), "l": len(landmarks), "h": len(state.roots)}
+    whole = dataclasses.replace(rest, factors=left, layout=layout_of(left, shape, None))
+    return Remainder(whole, rest_state, landmarks)
 
 
 # The Schur complement.
@@ -445,7 +246,7 @@ def _prior(
     the derivatives of turns by the coordinates of the last postures."""
     frames = min(count * CHUNK, len(left.cameras))
     none = np.zeros(len(left.landmarks), bool)
-    estimate = _cut(left, 0, frames, none)
+    estimate = restricted(left, 0, frames, none)
     size = 1 + len(left.intrinsics) + len(left.globals) + left.shapes.size
     size += 6 * frames + len(left.roots) * (6 * found.window.reach + 69)
     dtype = left.scale.dtype
@@ -475,7 +276,7 @@ def _prior(
     place[len(kept) - len(rest) :, rest] = np.eye(len(rest))
     matrix = place.T @ np.asarray(found.matrix)[np.ix_(kept, kept)] @ place
     slope = place.T @ np.asarray(found.slope)[kept]
-    gone = index.cameras[: 6 * (CHUNK - _reach(problem))]
+    gone = index.cameras[: 6 * (CHUNK - reach_of(problem))]
     matrix, slope = _without(matrix, slope, gone, float(np.finfo(dtype).eps))
     root, offset = square_root(matrix, slope, float(np.finfo(dtype).eps))
     diagonal = np.diag(matrix)[index.cameras].reshape(-1, 6)
