@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -10,11 +11,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.camera import arkit
-from bodyslam_jax.io.camera.calibration_files import (
-    choose_camera,
-    read_named_cameras,
-    to_opencv_params,
-)
+from bodyslam_jax.io.camera.calibration_files import NamedCamera, read_named_cameras
 from bodyslam_jax.io.camera.colmap import FoundCamera, read_cameras
 from bodyslam_jax.io.files import read_json_fields
 from bodyslam_jax.io.images import exif_focal_35mm
@@ -35,6 +32,8 @@ _IN_FOLDERS = (*_IN_FOLDERS, *arkit.CAMERA_FILES, "calib.txt")
 """Names of cameras' files, by which they are found in a folder."""
 _NUM_PARAMS = {"PINHOLE": 4, "SIMPLE_RADIAL": 4, "OPENCV": 8, "SIMPLE_PINHOLE": 3}
 """Models of `camera.json` and the number of their parameters."""
+_MAX_MISFIT_PX = 0.5
+"""Error, px, by which k1 k2 p1 p2 may differ from a richer model within the image."""
 
 
 def read_camera(
@@ -69,11 +68,11 @@ def read_camera(
         return _from_cameras(path, [arkit.read_arkit_camera(path, size)], size), None
     named = read_named_cameras(path)
     if named is not None:
-        chosen = choose_camera(path, named, wanted, size, video)
+        chosen = _choose_camera(path, named, wanted, size, video)
         size = chosen.size or size
         if size is None:
             raise InputError(f"{path}: of what image size? It needs the video.")
-        params = to_opencv_params(path, chosen, size)
+        params = _opencv_params(path, chosen, size)
         model = "PINHOLE" if len(params) == 4 else "OPENCV"
         found = _intrinsics(path, model, np.array(params), *size)
         return found, chosen.fps
@@ -150,6 +149,122 @@ def _intrinsics(
             f"image of {width}x{height} px."
         )
     return Intrinsics(params, width, height)
+
+
+def _choose_camera(
+    path: Path,
+    cameras: Iterable[NamedCamera],
+    wanted: str | None,
+    size: tuple[int, int] | None,
+    video: str,
+) -> NamedCamera:
+    """Returns the camera of the video among those of a file.
+
+    Args:
+        wanted: its name, or its number from 0, as the user gave it.
+        size: of the video, px.
+        video: name of the video, which may name the camera.
+
+    **Raises:** `InputError`, naming the file and its cameras, if it is not clear.
+    """
+    cameras = list(cameras)
+    names = ", ".join(camera.name[:30] for camera in cameras[:12])
+    if wanted is not None:
+        found = [c for c in cameras if c.name == wanted]
+        if not found and wanted.isdigit() and int(wanted) < len(cameras):
+            found = [cameras[int(wanted)]]
+        if len(found) != 1:
+            raise InputError(f"{path}: no camera {wanted!r}, expected one of {names}.")
+        return found[0]
+    if len(cameras) == 1:
+        return cameras[0]
+    named = [c for c in cameras if c.name and c.name.lower() == video.lower()]
+    if len(named) == 1:
+        return named[0]
+    raise InputError(
+        f"{path}: {len(cameras)} cameras ({names}), expected the video's: add its "
+        f"name or number, as in --camera {path}:{cameras[0].name}."
+    )
+
+
+def _opencv_params(
+    path: Path, camera: NamedCamera, size: tuple[int, int]
+) -> list[float]:
+    """Returns `fx fy cx cy`, and `k1 k2 p1 p2` if the camera is distorted.
+
+    A model with more coefficients is fitted by these within the image of `size`, px.
+
+    **Raises:** `InputError`, naming the file, if that leaves an error of more than half
+    a pixel, or the axes of the image are not at right angles.
+    """
+    K, distortion = camera.K, camera.distortion
+    if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
+        raise InputError(f"{path}: a skew of {K[0, 1]:g} px, expected 0: undistort.")
+    params = [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]
+    _check_centre(path, camera, size)
+    if not np.any(distortion):
+        return params
+    if len(distortion) > 4 and np.any(distortion[4:]):
+        distortion = _fitted(path, K, distortion, size)
+    four = np.zeros(4)
+    four[: min(len(distortion), 4)] = distortion[:4]
+    return [*params, *map(float, four)]
+
+
+def _check_centre(path: Path, camera: NamedCamera, size: tuple[int, int]) -> None:
+    """Refuses a calibration without an image size that is of another than `size`."""
+    if camera.size is not None:
+        return
+    x, y = camera.K[0, 2] / (size[0] - 1), camera.K[1, 2] / (size[1] - 1)
+    if x > 0 and y > 0 and abs(x / y - 1) < 0.03 and abs(x - 0.5) > 0.05:
+        raise InputError(
+            f"{path}: principal point {camera.K[0, 2]:g}, {camera.K[1, 2]:g} is the "
+            f"centre of images of about {2 * camera.K[0, 2]:.0f}x"
+            f"{2 * camera.K[1, 2]:.0f} px, but the video has {size[0]}x{size[1]}: "
+            "scale the calibration to the video."
+        )
+    if not (0 < x < 1 and 0 < y < 1):
+        raise InputError(
+            f"{path}: principal point {camera.K[0, 2]:g}, {camera.K[1, 2]:g} outside "
+            f"the image of {size[0]}x{size[1]} px: calibrated with images of another "
+            "size, or in other units? Scale it to the video's."
+        )
+
+
+def _fitted(
+    path: Path,
+    K: Float[np.ndarray, "3 3"],
+    distortion: Float[np.ndarray, " d"],
+    size: tuple[int, int],
+) -> Float[np.ndarray, " 4"]:
+    """Returns k1 k2 p1 p2 that are nearest to a richer model within the image."""
+    u, v = np.meshgrid(np.linspace(0, size[0] - 1, 25), np.linspace(0, size[1] - 1, 25))
+    uv = np.stack([u.ravel(), v.ravel()], axis=1)[:, None]
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-8)
+    xy = cv2.undistortPointsIter(uv, K, distortion, np.eye(3), np.eye(3), stop)[:, 0]
+    x, y = xy.T
+    r2 = (xy**2).sum(1)
+    zero = np.zeros(3)
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    full = cv2.projectPoints(rays, zero, zero, np.eye(3), distortion)[0][:, 0] - xy
+    columns = [
+        (x * r2, y * r2),
+        (x * r2**2, y * r2**2),
+        (2 * x * y, r2 + 2 * y**2),
+        (r2 + 2 * x**2, 2 * x * y),
+    ]
+    A = np.stack([np.concatenate(c) for c in columns], axis=1)
+    found = np.linalg.lstsq(A, np.concatenate(full.T), rcond=None)[0]
+    misfit = (A @ found - np.concatenate(full.T)).reshape(2, -1) * K[
+        [0, 1], [0, 1], None
+    ]
+    worst = float(np.linalg.norm(misfit, axis=0).max())
+    if not worst < _MAX_MISFIT_PX:
+        raise InputError(
+            f"{path}: distortion {distortion.tolist()} differs by {worst:.1f} px from "
+            "any with k1 k2 p1 p2, expected one of these: undistort the images first."
+        )
+    return found
 
 
 def guess_camera(
