@@ -1,5 +1,6 @@
 """Code in README.md and docs/ runs: blocks of a page in order, in one program."""
 
+import ast
 import importlib
 import inspect
 import re
@@ -96,6 +97,18 @@ def test_files_named_in_the_architecture_exist():
     page = (ROOT / "docs" / "architecture.md").read_text()
     for name in re.findall(r"`(bodyslam_jax/[\w/]+(?:\.py|/)?)`", page):
         assert (ROOT / name).exists(), name
+
+
+def test_names_that_the_architecture_finds_in_a_file_are_defined_there():
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    named = re.findall(r"`([\w.]+)` in `(bodyslam_jax/[\w/]+\.py)`", page)
+    assert len(named) > 15
+    for name, file in named:
+        body = ast.parse((ROOT / file).read_text()).body
+        for part in name.split("."):
+            found = [node for node in body if getattr(node, "name", None) == part]
+            assert found, f"{name} in {file}"
+            body = getattr(found[0], "body")
 
 
 REFERENCE = sorted((ROOT / "docs" / "reference").glob("*.md"))

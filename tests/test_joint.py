@@ -1,7 +1,6 @@
-"""What the joint problem is made of, without solving it."""
+"""The joint problem and its first state, without solving it."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +16,6 @@ from bodyslam_jax.types import (
     Bodies,
     Intrinsics,
     Keypoints,
-    ScaleStart,
     Sequence,
     SfmResult,
     Tracks,
@@ -56,84 +54,87 @@ def _cameras() -> SfmResult:
     )
 
 
+def _predicting(monkeypatch, prediction: motion.Prediction) -> None:
+    """Replaces the motion model, as its network is not what is tested."""
+    monkeypatch.setattr(joint_problem, "predict", lambda *_: prediction)
+
+
 @pytest.fixture
-def unsolved(monkeypatch):
-    """`prepare` with no valid prediction."""
-    invalid = _prediction(jnp.zeros(3), jnp.zeros(T, bool))
-    monkeypatch.setattr(joint_problem, "predict", lambda *_: invalid)
+def unpredicted(monkeypatch):
+    """Without a valid prediction of the motion model."""
+    _predicting(monkeypatch, _prediction(jnp.zeros(3), jnp.zeros(T, bool)))
+
+
+def _walk() -> tuple[Sequence, SfmResult, Bodies]:
+    """A person who stays before a camera that moves by one unit of the map a frame, at
+    one frame a second, for six frames."""
+    longer = lambda x: np.concatenate([x, x[:, :2]], axis=1)
+    bodies = Bodies(*(longer(x) for x in dataclasses.astuple(_bodies())[:4]))
+    T_WC = np.tile(np.eye(4), (6, 1, 1))
+    T_WC[:, 0, 3] = np.arange(6)
+    cameras = dataclasses.replace(_cameras(), T_WC=T_WC, registered=np.ones(6, bool))
+    sequence = dataclasses.replace(_sequence(bodies), timestamps=np.arange(6) / 1.0)
+    return sequence, cameras, bodies
+
+
+def _steps_of(problem: graph.Problem) -> graph.HumanMotion:
+    (found,) = (f for f in problem.factors if isinstance(f, graph.HumanMotion))
+    return found
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("fitted", "share"), [(False, 0.07), (True, 0.31)])
 def test_steps_share_the_error_of_where_their_bodies_came_from(
-    monkeypatch, unsolved, fitted, share
+    monkeypatch, fitted, share
 ):
-    errors = []
+    _predicting(monkeypatch, _prediction(jnp.array([0.5, 0.0, 0.0]), jnp.arange(6) > 0))
+    sequence, cameras, bodies = _walk()
+    if fitted:
+        seen = Keypoints(np.full((1, 6, 25, 2), 200.0), np.ones((1, 6, 25)))
+        sequence = dataclasses.replace(sequence, bodies=None, keypoints=seen)
+    body = load_body_model(dtype=jnp.float64)
 
-    def motion_factor(*_, shared_error, **__):
-        errors.append(float(shared_error[0]))
-        return _no_factor()
+    def prepared(**errors):
+        weights = GraphWeights(motion_correlation=0.0, **errors)
+        config = dataclasses.replace(Config(), weights=weights)
+        return joint_problem.prepare(sequence, cameras, bodies, body, config)
 
-    def scale_start(*_, shared_error, **__):
-        errors.append(shared_error)
-        return ScaleStart(motion=2.0, motion_error=0.1)
+    def information(one):
+        """On a common factor of all steps."""
+        steps = _steps_of(one.problem)
+        whitened = steps.whitening @ steps.translation[..., None]
+        return float(jnp.sum(whitened**2))
 
-    # Nothing is compiled: the error that steps share is decided before.
-    monkeypatch.setattr(initialisation, "motion_factor", motion_factor)
-    monkeypatch.setattr(initialisation, "scale_start", scale_start)
-    monkeypatch.setattr(initialisation, "ground_contact", lambda *_: None)
-    monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
-    empty = functools.partial(graph.make_problem, ())
-    monkeypatch.setattr(graph, "make_problem", lambda _, state, **__: empty(state))
-    seen = Keypoints(np.zeros((1, T, 25, 2)), np.ones((1, T, 25)))
-    sequence = dataclasses.replace(
-        _sequence(None if fitted else _bodies()), keypoints=seen if fitted else None
-    )
-    weights = GraphWeights(step_error=0.07, fitted_step_error=0.31)
-    prepared = joint_problem.prepare(
-        sequence,
-        _cameras(),
-        _bodies(),
-        load_body_model(dtype=jnp.float64),
-        dataclasses.replace(Config(), weights=weights),
-    )
-    assert errors == [share] * 2  # first scale, joint problem
-    assert float(prepared.state.scale) == pytest.approx(2)
+    exact = prepared(step_error=0.0, fitted_step_error=0.0)
+    found = prepared(step_error=0.07, fitted_step_error=0.31)
+    # A step of 0.5 m is one unit of the map.
+    assert float(found.state.scale) == pytest.approx(0.5)
+    whole = information(exact)
+    assert information(found) == pytest.approx(whole / (1 + share**2 * whole))
+    more = np.hypot(exact.scale.motion_error, share * 0.5)
+    assert found.scale.motion_error == pytest.approx(more)
 
 
 def test_steps_of_who_is_carried_are_left_out_where_another_cue_has_the_scale(
     monkeypatch,
-    unsolved,
 ):
-    calls = []
-
-    def motion_factor(*_, without, **__):
-        calls.append(("term", list(without)))
-        return _no_factor()
-
-    def scale_start(*_, without, **__):
-        calls.append(("scale", list(without)))
-        return ScaleStart(motion=2.0, motion_error=0.1, **cue)
-
-    monkeypatch.setattr(initialisation, "motion_factor", motion_factor)
-    monkeypatch.setattr(initialisation, "scale_start", scale_start)
-    monkeypatch.setattr(initialisation, "carried", lambda *_: {0: (1.2, 0.1)})
-    monkeypatch.setattr(initialisation, "ground_contact", lambda *_: None)
-    monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
-    empty = functools.partial(graph.make_problem, ())
-    monkeypatch.setattr(graph, "make_problem", lambda _, state, **__: empty(state))
+    _predicting(monkeypatch, _prediction(jnp.array([0.5, 0.0, 0.0]), jnp.arange(6) > 0))
+    sequence, cameras, bodies = _walk()
     body = load_body_model(dtype=jnp.float64)
-    prepare = lambda: joint_problem.prepare(
-        _sequence(_bodies()), _cameras(), _bodies(), body, Config()
+    prepare = lambda cameras: joint_problem.prepare(
+        sequence, cameras, bodies, body, Config()
     )
-    cue = {}
-    assert prepare().warnings == ()
-    assert calls == [("scale", []), ("term", [])]
-    calls.clear()
-    cue = {"ground": 3.0, "ground_error": 0.1}
-    (line,) = prepare().warnings
-    assert "person 0 moves at 1.2 m/s" in line
-    assert calls == [("scale", []), ("scale", [0]), ("term", [0])]
+    alone = prepare(cameras)
+    assert alone.warnings == () and alone.passengers == ()
+    assert float(alone.state.scale) == pytest.approx(0.5)
+    assert np.asarray(_steps_of(alone.problem).whitening).any()
+    # By a path in metres the person moves at 3 m/s, not at 0.5.
+    both = prepare(dataclasses.replace(cameras, path_scale=3.0))
+    assert both.passengers == (0,)
+    (line,) = both.warnings
+    assert "person 0 moves at 3.0 m/s" in line
+    assert float(both.state.scale) == pytest.approx(3.0)
+    assert not np.asarray(_steps_of(both.problem).whitening).any()
 
 
 def test_only_keypoints_tell_the_place_better_than_a_regressor_does():
@@ -188,7 +189,7 @@ def test_people_whom_no_keypoint_shows_stay_where_a_regressor_has_them():
 
 
 @pytest.mark.parametrize("shot", [slice(0, 3), slice(1, 4)])
-def test_nothing_moves_beyond_a_cut(monkeypatch, unsolved, shot):
+def test_nothing_moves_beyond_a_cut(unpredicted, shot):
     located = np.zeros(T, bool)
     located[shot] = True
     T_WC = np.tile(np.eye(4), (T, 1, 1))
@@ -196,11 +197,6 @@ def test_nothing_moves_beyond_a_cut(monkeypatch, unsolved, shot):
     cameras = dataclasses.replace(_cameras(), registered=located, T_WC=T_WC)
     seen = Keypoints(np.full((1, T, 25, 2), 200.0), np.ones((1, T, 25)))
     sequence = dataclasses.replace(_sequence(_bodies()), keypoints=seen)
-    monkeypatch.setattr(initialisation, "motion_factor", lambda *_, **__: _no_factor())
-    monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
-    monkeypatch.setattr(
-        initialisation, "scale_start", lambda *_, **__: ScaleStart(2.0, 0.1)
-    )
     body = load_body_model(dtype=jnp.float64)
     prepared = joint_problem.prepare(sequence, cameras, _bodies(), body, Config())
     free = np.asarray(prepared.problem.free.cameras)
@@ -213,11 +209,6 @@ def test_nothing_moves_beyond_a_cut(monkeypatch, unsolved, shot):
     for factor in prepared.problem.factors:
         if isinstance(factor, graph.KeypointReprojection):
             assert np.isinf(np.asarray(factor.sigma)[0, ~located]).all()
-
-
-def _no_factor() -> graph.CameraPrior:
-    """One that says nothing."""
-    return graph.CameraPrior(jnp.tile(jnp.eye(4), (T, 1, 1)), jnp.full((T, 6), jnp.inf))
 
 
 def test_frames_that_are_used_are_those_of_the_shot():
@@ -363,11 +354,12 @@ def test_keypoints_of_the_papers_preset_saturate_at_the_same_distance():
 
 def _prediction(step, valid):
     """What a motion model says that has everybody's joints turned by 0.2 rad."""
+    frames = len(valid)
     of_one = motion.Prediction(
-        translation=jnp.tile(step, (T, 1)),
-        covariance=jnp.tile(1e-4 * jnp.eye(3), (T, 1, 1)),
-        body_pose=jnp.full((T, 23, 3), 0.2),
-        rotation=jnp.zeros((T, 3)),
+        translation=jnp.tile(step, (frames, 1)),
+        covariance=jnp.tile(1e-4 * jnp.eye(3), (frames, 1, 1)),
+        body_pose=jnp.full((frames, 23, 3), 0.2),
+        rotation=jnp.zeros((frames, 3)),
         valid=valid,
     )
     return jax.tree.map(lambda x: x[None], of_one)
@@ -400,12 +392,11 @@ def test_displacements_of_the_papers_preset_are_in_metres():
 @pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["frozen", "refreshed"])
 def test_postures_are_held_to_predictions_only_where_there_are_any(
-    monkeypatch, unsolved, coupling
+    monkeypatch, coupling
 ):
     """Not in the frames after a gap, in which what stands there means nothing."""
     valid = np.array([[False, False, True, False]])
-    predicted = _prediction(jnp.zeros(3), jnp.asarray(valid[0]))
-    monkeypatch.setattr(joint_problem, "predict", lambda *_: predicted)
+    _predicting(monkeypatch, _prediction(jnp.zeros(3), jnp.asarray(valid[0])))
     seen = Keypoints(np.full((1, T, 25, 2), 200.0), np.ones((1, T, 25)))
     sequence = dataclasses.replace(_sequence(_bodies()), keypoints=seen)
     config = dataclasses.replace(Config.paper(), motion_coupling=coupling)

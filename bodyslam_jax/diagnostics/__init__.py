@@ -1,4 +1,8 @@
-"""Checks whether inputs agree with each other and whether a result is plausible."""
+"""Checks whether inputs agree with each other and whether a result is plausible.
+
+`verdict.py` decides the status of a result (`ok`, `doubtful`, `failed`) by the rules in
+`checks.py`; `agreement/` compares the inputs.
+"""
 
 from bodyslam_jax.diagnostics.agreement import reconcile as reconcile
 from bodyslam_jax.diagnostics.checks import Reason as Reason

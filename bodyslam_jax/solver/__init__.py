@@ -1,4 +1,10 @@
-"""Solves factor-graph problems by structured Levenberg-Marquardt; covariances."""
+"""Solves factor-graph problems by structured Levenberg-Marquardt; covariances.
+
+`solve.py` has the interface, `levenberg_marquardt.py` damping and acceptance,
+`linear_system.py` one step and its elimination order, `covariance.py` the posterior,
+`marginalisation.py` the prior that replaces the first frames, `implicit.py` derivatives
+of a solution.
+"""
 
 from bodyslam_jax.solver.batching import vmap_over_devices as vmap_over_devices
 from bodyslam_jax.solver.compilation import quick_options as quick_options

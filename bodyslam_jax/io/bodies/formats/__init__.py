@@ -1,1 +1,4 @@
-"""Body formats: every `BodyFormat` in a module of this folder is read."""
+"""Body formats: every `BodyFormat` in a module of this folder is read.
+
+A new format is a subclass (`io/bodies/body_format.py`) in a file of its own.
+"""
