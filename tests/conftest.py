@@ -46,9 +46,9 @@ def drop_programs() -> None:
 @pytest.fixture(scope="session", autouse=True)
 def memory_returned():
     """Freed memory goes back to the system, as in the command."""
-    from bodyslam_jax.cli import memory  # not before XLA's flags are set
+    from bodyslam_jax.cli import jax_setup  # not before XLA's flags are set
 
-    memory.return_memory()
+    jax_setup.return_memory()
 
 
 @pytest.fixture(scope="module", autouse=True)

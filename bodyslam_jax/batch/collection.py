@@ -56,7 +56,7 @@ def write_tables(
 def _thumbnails(folder: Path, found: list[table.Row]) -> dict[str, str]:
     """Writes still images of the overlays, and returns their paths by the clip's
     name."""
-    from bodyslam_jax.view.thumbnail import write_thumbnail
+    from bodyslam_jax.view.video_file import write_thumbnail
 
     made = {}
     for row in found:

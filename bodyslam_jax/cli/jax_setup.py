@@ -1,18 +1,26 @@
-"""How the command line sets up JAX: 64 bit, the cache of compiled programs, device."""
+"""Sets up JAX for the command line: 64 bit, cache of programs, device, memory."""
 
+import ctypes
 import gc
 import importlib.metadata
 import logging
 import os
+import platform
 
 from bodyslam_jax.batch.program_cache import user_folder
 from bodyslam_jax.cli import interrupts
-from bodyslam_jax.cli.memory import return_memory
 from bodyslam_jax.config.errors import InputError
 
 _COLLECT_AFTER = 50_000
 """New objects between two collections of reference cycles. Tracing makes millions of
 objects that stay alive: Python's 700 costs a tenth of tracing time."""
+_COMPILATION_EVENT = "/jax/core/compile/backend_compile_duration"
+_MIN_COMPILATION_S = 0.5
+"""Compilations shorter than this free little memory, s."""
+_MMAP_THRESHOLD = -3
+"""`M_MMAP_THRESHOLD` of `malloc.h`."""
+_MIN_MMAP_BYTES = 1 << 20
+"""Size from which arrays have pages of their own, bytes."""
 
 
 def prepare(device: str | None) -> None:
@@ -48,6 +56,26 @@ def set_compiler_flags() -> None:
     given = os.environ.get("XLA_FLAGS", "")
     if importlib.metadata.version("jaxlib").startswith("0.10.") and flag not in given:
         os.environ["XLA_FLAGS"] = f"{given} {flag}=false".strip()
+
+
+def return_memory() -> None:
+    """Returns freed memory to the system, where the C library is glibc.
+
+    glibc keeps it for later allocations: hundreds of megabytes in small pieces after
+    each compilation, and arrays up to 32 MB. A long video would need twice the memory.
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return
+    import jax
+
+    library = ctypes.CDLL(None)
+    library.mallopt(_MMAP_THRESHOLD, _MIN_MMAP_BYTES)
+
+    def trim(event: str, duration_secs: float, **_: object) -> None:
+        if event == _COMPILATION_EVENT and duration_secs > _MIN_COMPILATION_S:
+            library.malloc_trim(0)
+
+    jax.monitoring.register_event_duration_secs_listener(trim)
 
 
 def _choose_device(device: str | None) -> None:

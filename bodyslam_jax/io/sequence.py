@@ -9,7 +9,6 @@ import numpy as np
 from bodyslam_jax.config import Association, Config, Known
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import budget
-from bodyslam_jax.io.aspect import aspect_warnings, at_size_of
 from bodyslam_jax.io.bodies.reader import read_bodies
 from bodyslam_jax.io.camera.calibration import guess_camera, read_camera, with_focal
 from bodyslam_jax.io.camera.path import read_camera_path
@@ -42,6 +41,8 @@ _RATE_TOLERANCE = 0.02
 """Relative difference of the frame rates of camera.json and of the video."""
 _DEFAULT_RATE = 30.0
 """Frame rate where no file has one, 1/s."""
+_ASPECT_TOLERANCE = 0.01
+"""Difference of an aspect ratio from 1 up to which it counts as 1."""
 
 
 def read_sequence(
@@ -240,7 +241,7 @@ def _intrinsics(
     if calibrated is not None:
         intrinsics = calibrated
         if footage:
-            intrinsics = at_size_of(intrinsics, footage)
+            intrinsics = _in_stored_pixels(intrinsics, footage)
             _check_size(parts, intrinsics, footage)
             if not known.fps:
                 _check_rate(fps, footage, warn)
@@ -252,7 +253,7 @@ def _intrinsics(
     else:
         raise InputError(f"{path}: tracks without a video need a camera.json.")
     if footage:
-        for text in aspect_warnings(intrinsics, footage):
+        for text in _aspect_warnings(intrinsics, footage):
             warn(text)
     if calibrated is None and known.focal is None and known.fov is None:
         warn(f"no camera.json: focal length guessed, {intrinsics.params[0]:.0f} px.")
@@ -261,6 +262,42 @@ def _intrinsics(
         return intrinsics
     # Of the principal point the file was asked already, and a guess is in the middle.
     return recognised("focal", with_focal(intrinsics, *focal), lambda text: None)
+
+
+def _in_stored_pixels(intrinsics: Intrinsics, footage: Footage) -> Intrinsics:
+    """Returns the camera in stored pixels, if it was calibrated in images that a player
+    has stretched to square pixels; unchanged otherwise.
+
+    Images are never stretched: keypoints, masks and results are in the stored pixels,
+    and fx differs from fy. `fy / fx` is the width of a pixel over its height.
+    """
+    shown = round(footage.width * footage.pixel_aspect), footage.height
+    stored = footage.width, footage.height
+    if shown == stored or (intrinsics.width, intrinsics.height) != shown:
+        return intrinsics
+    ratio = footage.width / shown[0]
+    params = np.array(intrinsics.params, float)
+    params[0] *= ratio
+    params[2] = (params[2] + 0.5) * ratio - 0.5
+    return dataclasses.replace(intrinsics, params=params, width=footage.width)
+
+
+def _aspect_warnings(intrinsics: Intrinsics, footage: Footage) -> tuple[str, ...]:
+    """Returns warnings about pixels that are not square."""
+    declared = footage.pixel_aspect
+    used = float(intrinsics.params[1] / intrinsics.params[0])
+    if abs(declared - 1) < _ASPECT_TOLERANCE:
+        return ()
+    name = footage.path.name
+    if abs(used / declared - 1) < _ASPECT_TOLERANCE:
+        return (
+            f"{name}: pixels {declared:.4g} times as wide as high, by the container: "
+            "fx and fy differ by that.",
+        )
+    return (
+        f"{name}: pixels {declared:.4g} times as wide as high, by the container, but "
+        f"camera.json has fy/fx = {used:.4g}: camera.json used.",
+    )
 
 
 def _check_size(parts: Parts, intrinsics: Intrinsics, footage: Footage) -> None:

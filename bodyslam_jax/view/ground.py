@@ -3,13 +3,13 @@
 import cv2
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.geometry.stances import standing_feet
 from bodyslam_jax.types import Result
-from bodyslam_jax.view.contacts import feet_on_the_ground
 from bodyslam_jax.view.style import PEOPLE, Image
 
 _GRID_MARGIN_M = 3.0
@@ -22,6 +22,7 @@ _MIN_DEPTH_M = 0.3
 _WHITE = (255, 255, 255)
 _FOOT_MARK_RADIUS_M = 0.14
 """Radius of a mark under a foot, m."""
+_UP = np.array([0.0, 1.0, 0.0])
 
 
 class Ground:
@@ -70,6 +71,18 @@ class Ground:
         uv = np.asarray(project(intrinsics, jnp.asarray(p_C, intrinsics.dtype)))
         # Pixel centres are whole numbers, so the image's edge is at -1/2.
         return (uv + 0.5) * self.zoom - 0.5, p_C[..., 2] > _MIN_DEPTH_M
+
+
+def feet_on_the_ground(result: Result) -> Bool[np.ndarray, "h t 2"]:
+    """Returns, for each frame, whether each person's left and right foot is in contact
+    with the ground: the lower foot, while it is slow (`geometry.stances`)."""
+    stands = np.zeros((*result.present.shape, 2), bool)
+    for h, present in enumerate(result.present):
+        for run in runs(present):
+            feet = result.joints[h, run][:, list(FEET)]
+            slow, lower = standing_feet(feet, _UP, result.fps)
+            stands[h, np.arange(run.start, run.stop), lower] = slow
+    return stands
 
 
 def _grid(result: Result) -> Float[np.ndarray, "n m 3"]:

@@ -19,7 +19,7 @@ from bodyslam_jax.diagnostics.reported_status import inferred_bones, reported_st
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.types import Result
-from bodyslam_jax.view.contacts import feet_on_the_ground
+from bodyslam_jax.view.ground import feet_on_the_ground
 from bodyslam_jax.view.style import PEOPLE
 from bodyslam_jax.view.video_samples import VideoSamples
 

@@ -1,4 +1,7 @@
-"""Video files that browsers play: `.webm` by OpenCV, `.mp4` (H.264) by PyAV."""
+"""Video files that browsers play: `.webm` by OpenCV, `.mp4` (H.264) by PyAV.
+
+A thumbnail is a small still image of such a file, for pages that list many.
+"""
 
 import concurrent.futures
 import contextlib
@@ -14,11 +17,15 @@ from typing import Literal
 import cv2
 
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io import atomic
+from bodyslam_jax.io.video import open_video
 from bodyslam_jax.view.style import Image
 
 Codec = Literal["VP8", "VP9", "H264"]
 _H264_RATE_FACTOR = "24"
 """Constant rate factor of H.264: smaller is better and larger; 18 to 28 is usual."""
+_THUMBNAIL_WIDTH_PX, _THUMBNAIL_QUALITY = 240, 70
+"""Width, px, and quality of JPEG, 0 to 100."""
 
 
 def check_codec(codec: Codec) -> None:
@@ -134,3 +141,34 @@ def _quiet() -> Iterator[None]:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nothing)
+
+
+def write_thumbnail(video: Path, path: Path) -> bool:
+    """Writes the middle frame as JPEG; returns False if the video has none.
+
+    A file that is newer than the video is kept.
+    """
+    if path.exists() and path.stat().st_mtime >= video.stat().st_mtime:
+        return True
+    try:
+        capture = open_video(video)
+    except InputError:
+        return False
+    try:
+        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        capture.set(cv2.CAP_PROP_POS_FRAMES, max(0, count // 2))
+        found, image = capture.read()
+    finally:
+        capture.release()
+    if not found:
+        return False
+    height = max(1, round(image.shape[0] * _THUMBNAIL_WIDTH_PX / image.shape[1]))
+    small = cv2.resize(
+        image, (_THUMBNAIL_WIDTH_PX, height), interpolation=cv2.INTER_AREA
+    )
+    encoded, data = cv2.imencode(
+        ".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _THUMBNAIL_QUALITY]
+    )
+    if encoded:
+        atomic.write_bytes(path, data.tobytes())
+    return encoded
