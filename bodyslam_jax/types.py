@@ -36,7 +36,7 @@ class Intrinsics:
 
     @property
     def is_refined(self) -> bool:
-        """Whether the focal length is a variable of the optimisation."""
+        """Returns True if the focal length is a variable of the optimisation."""
         return self.is_guess or self.focal_sigma is not None
 
 
@@ -245,13 +245,13 @@ class SfmResult:
 
     @property
     def focal(self) -> float:
-        """px"""
+        """Returns fx, px."""
         return float(self.intrinsics[0])
 
     @property
     def within(self) -> Bool[np.ndarray, " t"]:
-        """Frames from the first to the last registered one; others, such as those after
-        a cut, share no points with the map."""
+        """Returns the frames from the first to the last registered one; others, such as
+        those after a cut, share no points with the map."""
         frames = np.arange(len(self.registered))
         located = np.flatnonzero(self.registered)
         if self.kind == "failed" or not len(located):
@@ -283,12 +283,12 @@ class ScaleStart:
         return np.array(errors) ** -2.0
 
     def without_motion(self) -> "ScaleStart":
-        """Without the cue of people's motion."""
+        """Returns the start without the cue of people's motion."""
         return dataclasses.replace(self, motion=1.0, motion_error=float("inf"))
 
     @property
     def value(self) -> float:
-        """s; 1 without any cue, so that the map keeps its own unit."""
+        """Returns s; 1 without any cue, so that the map keeps its own unit."""
         weight = self._weights
         if not weight.any():
             return 1.0
@@ -297,7 +297,7 @@ class ScaleStart:
 
     @property
     def standard_error(self) -> float:
-        """Of `value`; infinite without any cue."""
+        """Returns the standard error of `value`; infinite without any cue."""
         total = self._weights.sum()
         return float(total**-0.5) if total else float("inf")
 
@@ -417,7 +417,7 @@ class Result:
 
     @property
     def located(self) -> Bool[np.ndarray, " t"]:
-        """Frames whose camera was estimated: from the first to the last of
+        """Returns the frames whose camera was estimated: from the first to the last of
         `frames_used` in the summary, if it has them. Other poses are finite fill."""
         frames = np.arange(len(self.timestamps))
         used = self.summary.get("frames_used")
@@ -440,7 +440,7 @@ class Result:
         return formats.export(self, Path(path), to, up, person, **more)
 
     def view(self, run: Path | str | None = None, **more: Any) -> Any:
-        """The result in 3D, for a notebook; with images of the video if its run folder
-        is given. All options are those of `view.notebook_scene`."""
+        """Shows the result in 3D in a notebook, with images of the video if its run
+        folder is given. All options are those of `view.notebook_scene`."""
         view = importlib.import_module("bodyslam_jax.view")
         return view.notebook_scene(self, None if run is None else Path(run), **more)

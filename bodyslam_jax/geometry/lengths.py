@@ -43,7 +43,7 @@ def padded_rows(count: int) -> int:
 
 
 def put(x: Any, dtype: Any = None) -> Array:
-    """`jnp.asarray` of an array of any shape, which compiles nothing.
+    """Returns `jnp.asarray` of an array of any shape without compiling a program.
 
     `jnp.asarray` compiles and keeps a program of a MiB for each shape that it meets:
     tables of tracks have another one in every window of a video.

@@ -67,7 +67,8 @@ def interpolate_path(
 
 
 def nearest(matrix: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3 3"]:
-    """The rotation that is nearest to a matrix: what rounding has left of one."""
+    """Returns the rotation that is nearest to a matrix, such as one with rounding
+    errors."""
     U, _, Vt = np.linalg.svd(matrix)
     return U @ Vt
 

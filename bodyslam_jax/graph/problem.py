@@ -397,7 +397,7 @@ def layout_of(
 
 
 def _tracks_of(factors: Sequence[Factor]) -> tuple[np.ndarray, np.ndarray, int]:
-    """Frame and landmark of each observation, and the number of chunks that a
+    """Returns frame and landmark of each observation, and the number of chunks that a
     `MarginalPrior` couples."""
     priors = [f for f in factors if isinstance(f, MarginalPrior)]
     if len(priors) > 1:
@@ -414,7 +414,8 @@ def _tracks_of(factors: Sequence[Factor]) -> tuple[np.ndarray, np.ndarray, int]:
 
 
 def in_one_layout(cases: Sequence[tuple[Problem, State]]) -> list[Problem]:
-    """The same problems with layouts of equal shapes, the least that holds them all.
+    """Returns the problems with layouts of equal shapes, the smallest ones that hold
+    all of them.
 
     **Raises:** `ValueError` if no common size holds each of them.
     """

@@ -26,7 +26,7 @@ _NAMES = {
 
 
 def names_of_terms(factors: Sequence[Factor]) -> list[str]:
-    """The name of each factor's term."""
+    """Returns the name of each factor's term."""
     names: list[str] = []
     count: dict[str, int] = {}
     for factor in factors:
@@ -38,8 +38,8 @@ def names_of_terms(factors: Sequence[Factor]) -> list[str]:
 
 
 def name_of_term(name: str) -> str:
-    """The name of a term that was called by its factor's class, `HumanMotion_2`; any
-    other name as it is."""
+    """Returns the name of a term that is given by its factor's class, such as
+    `HumanMotion_2`; any other name is returned as it is."""
     kind, _, number = name.partition("_")
     if not re.fullmatch(r"[A-Z]\w*", kind):
         return name

@@ -236,7 +236,7 @@ def decode_simcc(
 
 
 def to_body25(points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "25 3"]:
-    """BODY_25 from 17 (COCO), 26 (Halpe) or 133 (COCO-WholeBody) keypoints.
+    """Returns BODY_25 from 17 (COCO), 26 (Halpe) or 133 (COCO-WholeBody) keypoints.
 
     The neck is the midpoint of the shoulders, the mid-hip that of the hips.
     """

@@ -53,7 +53,7 @@ class PosturePrior(eqx.Module):
 def load_posture_prior(
     fps: float, dtype: np.dtype | type | None = None
 ) -> PosturePrior:
-    """The prior that ships with the package, for frames `1/fps` apart.
+    """Returns the prior that ships with the package, for frames `1/fps` apart.
 
     An autoregression is a sampled damped oscillator: its poles at another rate are
     powers of its poles at 30 fps.
@@ -79,11 +79,13 @@ _NAMES = ("mean", "basis", "lower", "upper", "autoregression")
 
 
 def posture_basis(count: int = 40) -> Float[np.ndarray, "69 k"]:
-    """The turns of joints in which estimates of postures differ from guesses, those
-    first in which they do most: orthonormal columns, the `basis` of a problem.
+    """Returns the directions of the joints' rotations along which estimates of postures
+    differ from initial guesses, in decreasing order of that difference: orthonormal
+    columns, the `basis` of a problem.
 
-    Derived by `tools/make_posture_basis.py` from what keypoints of BODY_25 tell. The
-    first 40 are those that keypoints tell at all: on simulated sequences they span
+    Derived by `tools/make_posture_basis.py` from the information of keypoints of
+    BODY_25. The first 40 are those that keypoints determine: on simulated sequences
+    they span
     97 % of the distance between guessed and estimated joints, 32 of them 85 %.
 
     **Raises:** `ValueError` if `count` is not between 1 and the 48 that there are.

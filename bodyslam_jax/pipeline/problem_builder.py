@@ -62,7 +62,8 @@ def stack_cases(
     config: Config | None = None,
     hold: tuple[str, ...] = (),
 ) -> tuple[graph.Problem, graph.State]:
-    """Several problems and first states as one of each, for `jax.vmap` and `jax.jit`.
+    """Returns several problems and first states stacked into one of each, for
+    `jax.vmap` and `jax.jit`.
 
     Arrays get a leading axis of cases. Shorter cases get frames, landmarks and
     observations that measure nothing and variables that may not move, up to the least

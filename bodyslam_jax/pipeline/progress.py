@@ -99,7 +99,8 @@ class Counter:
 
 
 def counted(items: Iterable[T], stage: str, total: int) -> Iterator[T]:
-    """The same items, of which there are `total`, with the progress of a `Counter`."""
+    """Yields the items, of which there are `total`, with the progress of a
+    `Counter`."""
     counter = Counter(stage, total)
     for k, item in enumerate(items):
         yield item
@@ -108,7 +109,8 @@ def counted(items: Iterable[T], stage: str, total: int) -> Iterator[T]:
 
 @contextlib.contextmanager
 def compiling(stage: str, size: str) -> Iterator[None]:
-    """A block in which the programs of a stage are compiled, unless they have been.
+    """Announces, before the block, that the programs of a stage are compiled in it,
+    unless they have been.
 
     Says before it how long that takes, once for a stage and `size` (the same for
     problems that share programs) on a machine: about as long as for another size of the

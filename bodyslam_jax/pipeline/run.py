@@ -170,7 +170,7 @@ def before_joint(
 
 
 def _size(sequence: Sequence) -> str:
-    """The sizes of arrays that decide which programs a sequence needs."""
+    """Returns the sizes of arrays that determine which programs a sequence needs."""
     keypoints, bodies = sequence.keypoints, sequence.bodies
     number = 0 if keypoints is None else len(keypoints.uv)
     if bodies is not None:

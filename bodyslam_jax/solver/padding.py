@@ -85,12 +85,14 @@ def stack(cases: Sequence[tuple[Problem, State]]) -> tuple[Problem, State]:
 
 
 def _as_array(leaf, dtype):
-    """Numbers that a factor was given as such, which `jax.vmap` would not map."""
+    """Returns a number of a factor as an array, so that `jax.vmap` can map it; other
+    leaves are returned as they are."""
     return jnp.asarray(leaf, dtype) if isinstance(leaf, float) else leaf
 
 
 def _difference(first, second) -> str | None:
-    """What differs in the structure of two problems with their states, in words."""
+    """Returns a text that says what differs in the structure of two problems with their
+    states; `None` if nothing does."""
     (problem, state), (other, other_state) = first, second
     pairs = {
         "terms": (problem.names, other.names),
@@ -138,7 +140,8 @@ def unpad(state: State, num_frames: int, num_landmarks: int) -> State:
 
 
 def first_rows(x: Array, count: int, axis: int = 0) -> Array:
-    """The first entries of an axis; outside of `jit` nothing is compiled for that."""
+    """Returns the first entries along an axis, outside of `jit` without compiling a
+    program."""
     at = (slice(None),) * axis + (slice(count),)
     return x[at] if isinstance(x, jax.core.Tracer) else put(np.asarray(x)[at])
 
