@@ -85,8 +85,8 @@ def posture_basis(count: int = 40) -> Float[np.ndarray, "69 k"]:
 
     Derived by `tools/make_posture_basis.py` from the information of keypoints of
     BODY_25. The first 40 are those that keypoints determine: on simulated sequences
-    they span
-    97 % of the distance between guessed and estimated joints, 32 of them 85 %.
+    they span 97 % of the distance between guessed and estimated joints, 32 of them
+    85 %.
 
     **Raises:** `ValueError` if `count` is not between 1 and the 48 that there are.
     """
