@@ -13,6 +13,10 @@ from bodyslam_jax.io.plain_arrays import VALUE_BYTES, Account, ArrayType, Refuse
 
 MAX_DEPTH = 64
 """Largest number of levels of nesting; results of tools have 10 at most."""
+OBJECT_BYTES = 300
+"""Memory of a container, bytes: an empty set, the largest, takes 240."""
+BLOB_BYTES = 4096
+"""Length from which bytes and Python 2's texts stay in the file until used, bytes."""
 
 
 class StandIn:
