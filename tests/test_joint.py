@@ -82,7 +82,6 @@ def test_steps_share_the_error_of_where_their_bodies_came_from(
     monkeypatch.setattr(initialisation, "motion_factor", motion_factor)
     monkeypatch.setattr(initialisation, "scale_start", scale_start)
     monkeypatch.setattr(initialisation, "ground_contact", lambda *_: None)
-    monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
     empty = functools.partial(graph.make_problem, ())
     monkeypatch.setattr(graph, "make_problem", lambda _, state, **__: empty(state))
     seen = Keypoints(np.zeros((1, T, 25, 2)), np.ones((1, T, 25)))
@@ -119,7 +118,6 @@ def test_steps_of_who_is_carried_are_left_out_where_another_cue_has_the_scale(
     monkeypatch.setattr(initialisation, "scale_start", scale_start)
     monkeypatch.setattr(initialisation, "carried", lambda *_: {0: (1.2, 0.1)})
     monkeypatch.setattr(initialisation, "ground_contact", lambda *_: None)
-    monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
     empty = functools.partial(graph.make_problem, ())
     monkeypatch.setattr(graph, "make_problem", lambda _, state, **__: empty(state))
     body = load_body_model(dtype=jnp.float64)
@@ -197,7 +195,6 @@ def test_nothing_moves_beyond_a_cut(monkeypatch, unsolved, shot):
     seen = Keypoints(np.full((1, T, 25, 2), 200.0), np.ones((1, T, 25)))
     sequence = dataclasses.replace(_sequence(_bodies()), keypoints=seen)
     monkeypatch.setattr(initialisation, "motion_factor", lambda *_, **__: _no_factor())
-    monkeypatch.setattr(initialisation, "optional_factors", lambda *_: [])
     monkeypatch.setattr(
         initialisation, "scale_start", lambda *_, **__: ScaleStart(2.0, 0.1)
     )
