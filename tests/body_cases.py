@@ -68,3 +68,12 @@ def smpl(raw, pose, beta, trans):
 def write(raw, path):
     np.savez(path, **raw)
     return path
+
+
+def crop_camera(trans, box, intrinsics):
+    """A network's `(s, tx, ty)`: the inverse of `full_translation`."""
+    fx, fy, px, py = intrinsics.params[:4]
+    x, y, z = trans.T
+    cx, cy, side = box.T
+    s = 2 * fx / (side * z)
+    return np.stack([s, x - z / fx * (cx - px), y * fy / fx - z / fx * (cy - py)], -1)

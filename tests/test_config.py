@@ -84,6 +84,10 @@ def test_settings_that_mean_something_are_let_in():
             "people_fit: {walking_knees: true}",
             "people_fit: `walking_knees` no longer exists: knees are as measured.",
         ),
+        (
+            "weights: {upright_sigma: 0.1}",
+            "weights: `upright_sigma` no longer exists: pipeline.run(factors=) takes",
+        ),
         ("smoothing_hz: 0.0", "smoothing_hz: found 0.0, expected more than 0"),
         (
             "tracking: {num_points: 0}",

@@ -13,12 +13,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from body_cases import crop_camera
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax.config import Association
 from bodyslam_jax.io import read_sequence
 from bodyslam_jax.io.bodies.body_format import body_formats
-from bodyslam_jax.io.bodies.perspective import crop_camera, full_translation
+from bodyslam_jax.io.bodies.perspective import full_translation
 from bodyslam_jax.io.bodies.reader import read_bodies
 from bodyslam_jax.io.camera.calibration import (
     as_opencv,

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from body_cases import crop_camera
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.io.bodies.perspective import crop_camera
 from bodyslam_jax.io.bodies.reader import read_bodies
 from bodyslam_jax.io.tracks import read_tracks
 from bodyslam_jax.types import Bodies, Intrinsics

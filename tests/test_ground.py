@@ -169,3 +169,20 @@ def test_steps_that_may_all_be_short_say_no_more_of_scale_than_that():
     alone = error(0.0)
     assert alone < 0.1
     np.testing.assert_allclose(error(share), np.hypot(alone, share), rtol=0.01)
+
+
+def test_up_is_the_mean_direction_of_trunks():
+    state = scenes.truth(np.random.default_rng(4), frames=30, people=2, landmarks=5)
+    lean = 0.2 * np.sin(np.arange(30) * 2 * np.pi / 10)  # about 0 on average
+    c, s, o = np.cos(lean), np.sin(lean), np.zeros(30)
+    tilt = np.array([[o + 1, o, o], [o, c, -s], [o, s, c]]).transpose(2, 0, 1)
+    back = np.asarray(state.cameras)[:, :3, :3].transpose(0, 2, 1)
+    roots = np.array(state.roots)
+    roots[:, :, :3, :3] = back @ np.diag([1.0, -1.0, -1.0]) @ tilt
+    roots[1, :5, :3, :3] = np.eye(3)
+    state = dataclasses.replace(state, roots=jnp.asarray(roots))
+    present = np.ones((2, 30), bool)
+    present[1, :10] = False  # a whole period
+    np.testing.assert_allclose(
+        initialisation.mean_up(state, present), [0, -1, 0], atol=1e-12
+    )

@@ -11,7 +11,11 @@ from typing import Any, TypeVar
 from bodyslam_jax.config.errors import InputError
 
 S = TypeVar("S")
-REMOVED = {"people_fit.walking_knees": "knees are as measured"}
+REMOVED = {
+    "people_fit.walking_knees": "knees are as measured",
+    "weights.orientation_sigma": "pipeline.run(factors=) takes RelativeOrientation",
+    "weights.upright_sigma": "pipeline.run(factors=) takes UprightPrior",
+}
 """Settings of earlier versions, with the stage before a dot, and their replacement."""
 _BOOL_BY_WORD = {"true": True, "yes": True, "false": False, "no": False}
 

@@ -65,9 +65,6 @@ class GraphWeights:
     holds β to the fit, whose reported standard deviation is the prior's, 1."""
     shape_each_frame: bool = False
     """Whether β of each frame is a separate measurement."""
-    orientation_sigma: float | None = None
-    """Standard deviation of the motion model's predicted turn in a frame of 1/30 s, rad
-    per axis. Without it, the prediction is not used."""
     root_sigma: float | None = 0.12
     """Stationary standard deviation of regressed root orientation, rad per axis.
     Without it, the orientation is not used."""
@@ -82,10 +79,6 @@ class GraphWeights:
     root_turning: float | None = 0.015
     """Standard deviation of a person's angular acceleration, rad per squared frame of
     1/30 s. Without it, turning is not constrained."""
-    upright_sigma: float | None = None
-    """Standard deviation of the trunk's lean of a standing person from its mean
-    direction, rad in a frame of 1/30 s; not constrained without it. 0.1 suits walkers:
-    their pelvis sways by 0.05 rad, correlated over some five frames."""
     root_smoothness: float | None = 0.02
     """Standard deviation of the pelvis' acceleration, m per squared frame of 1/30 s;
     not constrained without it. Real ones are 0.006; that tight, a camera that follows

@@ -282,7 +282,7 @@ def _of_joints(result: Result, pair: tuple[Any, Any]) -> Row:
         return none
     x, y = np.asarray(mine.joints)[0][present], np.asarray(theirs.joints)[0][present]
     error = np.linalg.norm(_aligned(x, y) - y, axis=-1)
-    sigma = _claimed_there(result, mine, present)
+    sigma = _claimed_there(result, present)
     use = sigma > 0
     squares = (error[use] / sigma[use]) ** 2
     row: Row = {"z_joints": float(np.sqrt(squares.mean()))}
@@ -291,9 +291,7 @@ def _of_joints(result: Result, pair: tuple[Any, Any]) -> Row:
     return row
 
 
-def _claimed_there(
-    result: Result, mine: Any, present: np.ndarray
-) -> Float[np.ndarray, "f 24"]:
+def _claimed_there(result: Result, present: np.ndarray) -> Float[np.ndarray, "f 24"]:
     """Returns `joint_sigma` at the frames of a pairing, which may be cut to common
     times."""
     sigma = np.asarray(result.joint_sigma)[0]

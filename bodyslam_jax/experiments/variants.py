@@ -6,15 +6,8 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool
 
 from bodyslam_jax import graph
-from bodyslam_jax.body import BodyModel
-from bodyslam_jax.config import GraphWeights
-from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.experiments.problems import rebuild
-from bodyslam_jax.initialisation import upright_factor
 
 _SCALE_FACTORS = (
     graph.HumanMotion,
@@ -25,11 +18,6 @@ _SCALE_FACTORS = (
 
 Start = tuple[graph.Problem, graph.State]
 Variant = Callable[[graph.Problem, graph.State], Start]
-
-OPTIONAL_WEIGHTS = GraphWeights(upright_sigma=0.1)
-"""Sigmas of factors that are disabled by default: of an upright trunk, rad."""
-_FPS = 30.0
-"""Frame rate of the simulated sequences, 1/s."""
 
 
 def without(*kinds: type[graph.Factor]) -> Variant:
@@ -82,34 +70,6 @@ def with_regressed_shape(problem: graph.Problem, state: graph.State) -> Start:
     return held("shapes")(problem, dataclasses.replace(state, shapes=shapes))
 
 
-def beside(
-    make: Callable[
-        [BodyModel, graph.State, Bool[np.ndarray, "h t"]], graph.Factor | None
-    ],
-) -> Variant:
-    """Returns the variant with an additional factor, if `make` returns one."""
-
-    def variant(problem: graph.Problem, state: graph.State) -> Start:
-        body, present = _person(problem)
-        more = make(body, state, np.asarray(present))
-        factors = list(problem.factors)
-        if more is not None:
-            factors.append(more)
-        return rebuild(problem, state, factors), state
-
-    return variant
-
-
-def _person(problem: graph.Problem) -> tuple[BodyModel, Bool[Array, "h t"]]:
-    motion = problem.motion
-    if motion is not None:
-        return motion.body, motion.present
-    for factor in problem.factors:  # with frozen predictions there is no motion model
-        if isinstance(factor, graph.KeypointReprojection):
-            return factor.body, jnp.isfinite(factor.sigma).any(axis=-1)
-    raise InputError("the problem has no people; expected a moving person.")
-
-
 FULL = "full"
 VARIANTS: dict[str, Variant] = {
     FULL: lambda problem, state: (problem, state),
@@ -128,10 +88,5 @@ VARIANTS: dict[str, Variant] = {
     "no regressed shape": without(graph.ShapePrior),
     "β held at the regressor's": with_regressed_shape,
     "cameras and map held": held("cameras", "landmarks"),
-    "with up direction": beside(
-        lambda body, state, present: upright_factor(
-            state, present, _FPS, OPTIONAL_WEIGHTS
-        )
-    ),
 }
 """The variants of `ablation`, solved from the start of the full problem."""

@@ -10,6 +10,7 @@ from bodyslam_jax.initialisation.carried_people import (
     lines_of_carried as lines_of_carried,
 )
 from bodyslam_jax.initialisation.ground import ground_contact as ground_contact
+from bodyslam_jax.initialisation.ground import mean_up as mean_up
 from bodyslam_jax.initialisation.ground import (
     with_visible_feet as with_visible_feet,
 )
@@ -22,9 +23,6 @@ from bodyslam_jax.initialisation.map_factors import map_factor as map_factor
 from bodyslam_jax.initialisation.map_factors import path_factors as path_factors
 from bodyslam_jax.initialisation.map_factors import revisit_factor as revisit_factor
 from bodyslam_jax.initialisation.motion_factors import motion_factor as motion_factor
-from bodyslam_jax.initialisation.motion_factors import (
-    optional_factors as optional_factors,
-)
 from bodyslam_jax.initialisation.motion_factors import steps_shown as steps_shown
 from bodyslam_jax.initialisation.people_factors import contact_factor as contact_factor
 from bodyslam_jax.initialisation.people_factors import keypoint_sigma as keypoint_sigma
@@ -37,5 +35,3 @@ from bodyslam_jax.initialisation.placement import first_state as first_state
 from bodyslam_jax.initialisation.placement import free_people as free_people
 from bodyslam_jax.initialisation.placement import no_people as no_people
 from bodyslam_jax.initialisation.scale import scale_start as scale_start
-from bodyslam_jax.initialisation.upright import mean_up as mean_up
-from bodyslam_jax.initialisation.upright import upright_factor as upright_factor

@@ -14,7 +14,6 @@ from bodyslam_jax.config import GraphWeights
 from bodyslam_jax.geometry.ground_plane import find_ground
 from bodyslam_jax.geometry.lengths import padded_length, put
 from bodyslam_jax.geometry.local_ground import ground_under, running_median, wander
-from bodyslam_jax.initialisation.upright import mean_up
 from bodyslam_jax.types import Keypoints
 
 _MIN_CONFIDENCE = 0.2
@@ -70,6 +69,17 @@ def ground_contact(
         return None
     sigma = np.where(used, weights.ground_sigma * np.sqrt(used.sum()), np.inf)
     return eqx.tree_at(lambda f: f.sigma, contact, jnp.asarray(sigma))
+
+
+def mean_up(
+    state: graph.State, present: Bool[np.ndarray, "h t"]
+) -> Float[np.ndarray, "3"]:
+    """Returns the mean direction of people's trunks (y axes of their root frames) in
+    the world, a unit vector."""
+    ups = np.asarray(state.roots[..., :3, 1])
+    trunks = np.einsum("tij,htj->hti", np.asarray(state.cameras[:, :3, :3]), ups)
+    total = trunks[present].sum(axis=0)
+    return total / max(float(np.linalg.norm(total)), 1e-9)
 
 
 def with_visible_feet(

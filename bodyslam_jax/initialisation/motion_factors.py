@@ -1,6 +1,5 @@
 """Factors of the displacements and rotations that the motion model predicts."""
 
-import math
 from collections.abc import Collection
 
 import equinox as eqx
@@ -109,19 +108,3 @@ def _whitened_steps(prediction, shapes, body, weights, shared_error):
         return step, whitening
     leg = motion.leg_length(body, shapes)[:, None, None]
     return step / leg, whitening * leg[..., None]
-
-
-def optional_factors(
-    prediction: motion.Prediction, fps: float, weights: GraphWeights
-) -> list[graph.Factor]:
-    """Returns the factor of the predicted change of root orientation between frames.
-
-    The list is empty unless `weights.orientation_sigma` (rad, at 30 fps) is finite.
-    """
-    sigma = weights.orientation_sigma
-    if sigma is None or not math.isfinite(sigma):
-        return []
-    valid = prediction.valid
-    rotation = jnp.where(valid[..., None], prediction.rotation, 0.0)
-    per_frame = jnp.where(valid, sigma * 30.0 / fps, jnp.inf)
-    return [graph.RelativeOrientation(rotation=rotation, sigma=per_frame)]

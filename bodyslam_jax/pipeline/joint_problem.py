@@ -168,14 +168,15 @@ def prepare(
         start, passengers = _start_of_scale(
             sequence, cameras, crowd, state, steps, contact, present, config
         )
-        factors += _motion_factors(
-            steps,
-            state,
-            passengers,
-            shared_error=_shared_error(crowd.fitted, config),
-            fps=sequence.fps,
-            body=body,
-            config=config,
+        factors.append(
+            initialisation.motion_factor(
+                steps,
+                state.shapes,
+                body,
+                weights,
+                shared_error=_shared_error(crowd.fitted, config),
+                without=passengers,
+            )
         )
     elif moving and np.isfinite(cameras.path_scale):
         start = ScaleStart(
@@ -287,34 +288,9 @@ def _people_factors(
             weights,
             sequence.fps,
         )
-    present = roots.present & cameras.registered
-    upright = initialisation.upright_factor(state, present, sequence.fps, weights)
-    factors += [factor for factor in (contact, upright) if factor is not None]
+    if contact is not None:
+        factors.append(contact)
     return factors, contact
-
-
-def _motion_factors(
-    prediction: motion.Prediction,
-    state: graph.State,
-    passengers: Passengers,
-    *,
-    shared_error: Float[np.ndarray, " h"],
-    fps: float,
-    body: BodyModel,
-    config: Config,
-) -> list[graph.Factor]:
-    """Returns the factors of people's motion in the world."""
-    return [
-        initialisation.motion_factor(
-            prediction,
-            state.shapes,
-            body,
-            config.weights,
-            shared_error=shared_error,
-            without=passengers,
-        ),
-        *initialisation.optional_factors(prediction, fps, config.weights),
-    ]
 
 
 def _start_of_scale(

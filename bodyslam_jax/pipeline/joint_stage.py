@@ -95,7 +95,7 @@ def estimate(
         )
         stages += (stage,)
     best = solution.state
-    uncertainty = estimate_uncertainty(sequence, cameras, prepared, best, body, config)
+    uncertainty = estimate_uncertainty(sequence, prepared, best, body, config)
     standing = hold_standing_feet(prepared, best, sequence, cameras, body, config)
     variables, factors = own.found(alone, prepared.problem, best, uncertainty.marginals)
     estimate = of_state(
@@ -146,7 +146,6 @@ def of_state(
 
 def estimate_uncertainty(
     sequence: Sequence,
-    cameras: SfmResult,
     prepared: Prepared,
     best: graph.State,
     body: BodyModel,

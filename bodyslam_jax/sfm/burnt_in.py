@@ -63,8 +63,6 @@ class BurntIn:
     of_landmark: Bool[np.ndarray, " l"]
     still: Bool[np.ndarray, " l"]
     """Tracks that stay at their pixel, of the scene or not."""
-    num_pairs: int
-    """Number of pairs of frames with enough motion for the test."""
 
     @property
     def found(self) -> bool:
@@ -121,7 +119,7 @@ def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> Bu
     )
     # Tracks that are still for part of the time only, as at occlusions, are kept.
     burnt &= stays >= 0.5 * pairs
-    return BurntIn(burnt, (stays >= 0.5 * pairs) & (pairs > 0), telling)
+    return BurntIn(burnt, (stays >= 0.5 * pairs) & (pairs > 0))
 
 
 def without_burnt_in(

@@ -111,14 +111,14 @@ def dress(
     part = parts_of(person, outfit)
     skin = clothed_skin(person, outfit, part)
     weights, faces = person.weights, person.faces
-    colours = vertex_colours(person, outfit, part, rng)
+    colours = vertex_colours(person, part, rng)
     if outfit.skirt:
         cloth = SHIRT if outfit.is_dress else TROUSERS
         skin, weights, faces, part, colours = with_sheet(
             (skin, weights, faces, part, colours), skirt_sheet(person, outfit), cloth
         )
     mesh = skin, weights, faces, part, colours
-    skin, weights, faces, part, colours = with_shoes(mesh, person, outfit)
+    skin, weights, faces, part, colours = with_shoes(mesh, person)
     if outfit.hair in ("long", "tail"):
         skin, weights, faces, part, colours = with_sheet(
             (skin, weights, faces, part, colours), hair_sheet(person, outfit), HAIR
@@ -183,7 +183,7 @@ def smoother(faces: Int[np.ndarray, "f 3"], count: int) -> sparse.csr_matrix:
 
 
 def vertex_colours(
-    person: Person, outfit: Outfit, part: np.ndarray, rng: np.random.Generator
+    person: Person, part: np.ndarray, rng: np.random.Generator
 ) -> Float[np.ndarray, "v 3"]:
     """Returns the colour (BGR) of each vertex, by part, with some variation of skin and
     cloth."""

@@ -93,7 +93,7 @@ def hair_sheet(person: Person, outfit: Outfit):
     return rows, weights, False
 
 
-def with_shoes(mesh, person: Person, outfit: Outfit):
+def with_shoes(mesh, person: Person):
     """Returns the mesh with shoes: the convex hull of each foot, 8 mm thick."""
     skin, weights, faces, part, colours = mesh
     p, floor = person.skin, person.skin[:, 1].min()

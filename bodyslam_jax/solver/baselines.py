@@ -88,7 +88,7 @@ class _Flat(eqx.Module):
         return self.problem.cost(self.retract(step))
 
 
-def _flat(problem, state):
+def flat_problem(problem, state):
     refreshed = problem.refresh(state)
     return _Flat(refreshed, state, mask_of(refreshed)), state.zero_step()
 
@@ -97,7 +97,7 @@ def _residual(step, flat):
     return flat.residual(step)
 
 
-def _held_rows(step, flat):
+def held_rows(step, flat):
     """Returns residuals, and weak rows on all coordinates, without which those that no
     measurement sees would make a dense system singular."""
     held = jax.tree.map(lambda s: 1e-9 * s, step)
@@ -106,53 +106,14 @@ def _held_rows(step, flat):
 
 def optimistix_lm(problem, state, stage):
     """Runs the Levenberg-Marquardt of optimistix, dense, by QR."""
-    flat, zero = _flat(problem, state)
+    flat, zero = flat_problem(problem, state)
     method = optx.LevenbergMarquardt(
         rtol=stage.rtol, atol=stage.rtol, linear_solver=lx.QR()
     )
     found = optx.least_squares(
-        _held_rows, method, zero, flat, max_steps=4 * stage.max_steps, throw=False
+        held_rows, method, zero, flat, max_steps=4 * stage.max_steps, throw=False
     )
     return flat.retract(found.value), found.stats["num_steps"], found.result
-
-
-def optimistix_cg(problem, state, stage, inner_steps=500):
-    """Runs the Levenberg-Marquardt of optimistix with conjugate gradients on the normal
-    equations, which converge only for unknowns scaled to columns of unit length."""
-    flat, zero = _flat(problem, state)
-    unit = _units(flat, zero)
-    inner = lx.Normal(lx.CG(rtol=1e-6, atol=1e-6, max_steps=inner_steps))
-    method = optx.LevenbergMarquardt(
-        rtol=stage.rtol, atol=stage.rtol, linear_solver=inner
-    )
-    found = optx.least_squares(
-        _scaled_rows, method, zero, (flat, unit), max_steps=stage.max_steps, throw=False
-    )
-    step = jax.tree.map(jnp.multiply, unit, found.value)
-    return flat.retract(step), found.stats["num_steps"], found.result
-
-
-def _scaled_rows(step, given):
-    flat, unit = given
-    return _held_rows(jax.tree.map(jnp.multiply, unit, step), flat)
-
-
-NUM_SIGN_PROBES = 64
-"""Random sign vectors that estimate the lengths of columns: to about a tenth."""
-
-
-@eqx.filter_jit
-def _units(flat, zero):
-    """Estimates one over the lengths of the columns of the
-    Jacobian, by random signs."""
-    residual, pull = jax.vjp(flat.residual, zero)
-    keys = jax.random.split(jax.random.key(0), NUM_SIGN_PROBES)
-    signs = lambda key: jax.random.rademacher(key, residual.shape, residual.dtype)
-    squares = jax.lax.map(
-        lambda key: jax.tree.map(jnp.square, pull(signs(key))[0]), keys
-    )
-    unit = lambda s: jnp.where(s.mean(0) > 0, jax.lax.rsqrt(s.mean(0)), 1.0)
-    return jax.tree.map(unit, squares)
 
 
 def jaxopt_lm(problem, state, stage):
@@ -160,7 +121,7 @@ def jaxopt_lm(problem, state, stage):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         import jaxopt
-    flat, zero = _flat(problem, state)
+    flat, zero = flat_problem(problem, state)
     start, unravel = ravel_pytree(zero)
     arrays, static = eqx.partition(flat, eqx.is_array)
 
@@ -222,7 +183,7 @@ def adam_curve(problem, state, stage, rate, *, decays=False):
     With `decays` the rate falls to 0 as a cosine does. Where the cost is not finite the
     last state with a finite one is kept.
     """
-    flat, zero = _flat(problem, state)
+    flat, zero = flat_problem(problem, state)
     rate = jnp.asarray(rate, state.scale.dtype)
     found, costs = _adam(flat, zero, rate, stage.max_steps, decays)
     return flat.retract(found), costs

@@ -101,10 +101,6 @@ class LivePage:
             self.picture = encoded.tobytes()
         self.state = json.dumps(state).encode()
 
-    def forget_paths(self) -> None:
-        """Begins all paths again, where the world has changed by much."""
-        self.paths.clear()
-
     def close(self) -> None:
         """Ends the server."""
         self.server.shutdown()

@@ -2,8 +2,8 @@
 
     r = Log(C̃_k^T C_WH,k-1^T C_WH,k) / σ
 
-In rad. Off by default (`weights.orientation_sigma`). The paper's motion model predicts
-the turn, but the paper's cost does not use it. Ours.
+In rad. In no problem by default: the paper's motion model predicts the turn, but the
+paper's cost does not use it. Ours.
 """
 
 import jax.numpy as jnp

@@ -3,9 +3,8 @@
     r = (C_WC C_CH e_y - u) / σ
 
 `e_y` is the y axis of the root frame; the length of the difference is the angle by
-which the trunk leans, in rad, while that is small. Off by default;
-`weights.upright_sigma` = 0.1 rad at 30 fps suits people who walk (their pelvises sway
-by 0.05 rad). Ours.
+which the trunk leans, in rad, while that is small. In no problem by default;
+0.1 rad at 30 fps suits people who walk (their pelvises sway by 0.05 rad). Ours.
 """
 
 import jax.numpy as jnp

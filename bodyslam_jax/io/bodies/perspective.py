@@ -37,19 +37,6 @@ def full_translation(
     return np.stack([x, y, z], axis=-1)
 
 
-def crop_camera(
-    trans: Float[np.ndarray, "m 3"],
-    box: Float[np.ndarray, "m 3"],
-    intrinsics: Intrinsics,
-) -> Float[np.ndarray, "m 3"]:
-    """Returns the inverse of `full_translation`: the network's `(s, tx, ty)`."""
-    fx, fy, px, py = intrinsics.params[:4]
-    x, y, z = trans.T
-    cx, cy, side = box.T
-    s = 2 * fx / (side * z)
-    return np.stack([s, x - z / fx * (cx - px), y * fy / fx - z / fx * (cy - py)], -1)
-
-
 def turn_to_camera(
     orientation: Float[np.ndarray, "m 3"],
     box: Float[np.ndarray, "m 3"],
