@@ -45,6 +45,11 @@ class Refused(Exception):
     """The file asks for something that is not plain data, or for too much of it."""
 
 
+FREE_STEPS = 5_000_000
+"""Instructions of a pickle that its size need not account for; they take two
+seconds."""
+
+
 class Account:
     """What one file has made in memory so far, and may still make."""
 
@@ -55,9 +60,9 @@ class Account:
         # A file is held as a whole while arrays are made of it: half as much again,
         # so that a file of nearly the largest size cannot take twice its size.
         self.left = max_bytes * 3 // 2
-        self.steps = 5_000_000 + disk_bytes
+        self.steps = FREE_STEPS + disk_bytes
         """Instructions of pickles: each takes a byte at least, so only those of a
-        compressed file can be more than its bytes; 5 million take two seconds."""
+        compressed file can be more than its bytes."""
 
     def check(self, size: int, what: str) -> None:
         """**Raises:** `Refused` if one thing alone is larger than the budget."""
