@@ -611,7 +611,7 @@ def test_command_with_a_subset_resumes(tmp_path, monkeypatch, caplog):
 @pytest.fixture
 def few(tmp_path, monkeypatch):
     """Less of everything that is many times the same; a motion model of one's own."""
-    names = ("full", "no landmarks", "no smooth path", "no places seen again")
+    names = ("full", "no landmarks", "no places seen again")
     chosen = {name: experiments.VARIANTS[name] for name in names}
     monkeypatch.setattr(plans, "VARIANTS", chosen)
     name = "errors of frames independent"

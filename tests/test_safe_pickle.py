@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.io import plain_arrays
 from bodyslam_jax.io.safe_pickle import StandIn, restricted_load
 
 HOSTILE = Path(__file__).parents[2] / "shared" / "cases" / "files"
@@ -266,9 +267,14 @@ def test_bombs_are_refused_before_they_are_unpacked(tmp_path, name):
     assert "unpacks to" in refusal(tmp_path / name, content)
 
 
-@pytest.mark.slow
-def test_packed_instructions_are_bounded(tmp_path):
-    content = zlib.compress(program(b"N0" * 3_000_000, b"N"))
+def test_packed_instructions_are_bounded(tmp_path, monkeypatch):
+    assert plain_arrays.FREE_STEPS <= 5_000_000
+    # With types checked at run time, so many take a minute.
+    monkeypatch.setattr(plain_arrays, "FREE_STEPS", 50_000)
+    content = zlib.compress(program(b"N0" * 20_000, b"N"))
+    (tmp_path / "a.pkl").write_bytes(content)
+    restricted_load(tmp_path / "a.pkl")
+    content = zlib.compress(program(b"N0" * 30_000, b"N"))
     (tmp_path / "a.pkl").write_bytes(content)
     with pytest.raises(InputError, match="more instructions"):
         restricted_load(tmp_path / "a.pkl")

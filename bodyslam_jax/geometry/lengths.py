@@ -62,7 +62,7 @@ def lengthened(tree: Any, frames: int, axis: int = 0) -> Any:
         widths = [(0, missing if a == axis else 0) for a in range(x.ndim)]
         if isinstance(x, jax.core.Tracer):
             return jnp.pad(x, widths, mode="edge")
-        return jnp.asarray(np.pad(np.asarray(x), widths, mode="edge"))
+        return put(np.pad(np.asarray(x), widths, mode="edge"))
 
     return jax.tree.map(one, tree)
 
@@ -72,7 +72,6 @@ def shortened(tree: Any, frames: int, axis: int = 0) -> Any:
 
     def one(x):
         at = (slice(None),) * axis + (slice(frames),)
-        known = x if isinstance(x, jax.core.Tracer) else np.asarray(x)
-        return jnp.asarray(known[at])
+        return x[at] if isinstance(x, jax.core.Tracer) else put(np.asarray(x)[at])
 
     return jax.tree.map(one, tree)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from bodyslam_jax.geometry.lengths import round_up
+from bodyslam_jax.geometry.lengths import put, round_up
 from bodyslam_jax.graph import sizes
 from bodyslam_jax.graph.long_tracks import choose_long_tracks
 from bodyslam_jax.graph.ordering import CHUNK, PERSON_COORDINATES, order_chunks
@@ -346,4 +346,4 @@ def _fill(chunks, groups, width, frame, rows, begin, n=None):
     source = rows[begin[members][which] + within]
     at = frame[source] - first_chunk[group][which] * CHUNK
     row[group[which], at, slot[which]] = source
-    return Bucket(jnp.asarray(first_chunk), jnp.asarray(table), jnp.asarray(row), width)
+    return Bucket(put(first_chunk), put(table), put(row), width)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from bodyslam_jax.geometry.lengths import put
 from bodyslam_jax.graph.annotations import array_annotations
 from bodyslam_jax.graph.factor import FrameFactor
 from bodyslam_jax.graph.losses import Loss
@@ -122,7 +123,7 @@ def pad_factor(factor: FrameFactor, state: State, frames: int) -> FrameFactor:
         return padded
     present = np.ones((*lead[:-1], lead[-1] + frames), bool)
     present[..., lead[-1] :] = False
-    return Masked(factor=padded, present=jnp.asarray(present))
+    return Masked(factor=padded, present=put(present))
 
 
 def _is_over_frames(factor: FrameFactor) -> bool:
@@ -148,11 +149,14 @@ def extend(x: Array, axis: int, count: int, fill: Any) -> Array:
     Uses NumPy outside of `jit`: JAX would compile one small program per shape.
     """
     widths = [(0, count) if a == axis else (0, 0) for a in range(x.ndim)]
-    traced = isinstance(x, jax.core.Tracer)
-    grow = jnp.pad if traced else lambda a, *w, **k: np.pad(np.asarray(a), *w, **k)
-    if isinstance(fill, str):
-        return jnp.asarray(grow(x, widths, mode=fill))
-    return jnp.asarray(grow(x, widths, constant_values=np.asarray(fill, x.dtype)))
+    how: dict[str, Any] = (
+        {"mode": fill}
+        if isinstance(fill, str)
+        else {"constant_values": np.asarray(fill, x.dtype)}
+    )
+    if isinstance(x, jax.core.Tracer):
+        return jnp.pad(x, widths, **how)
+    return put(np.pad(np.asarray(x), widths, **how))
 
 
 def check_padding(factor: FrameFactor, state: State) -> None:

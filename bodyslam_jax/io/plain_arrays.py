@@ -46,6 +46,11 @@ class Refused(Exception):
     """The file asks for something that is not plain data, or for too much of it."""
 
 
+FREE_STEPS = 5_000_000
+"""Instructions of a pickle that its size need not account for; they take two
+seconds."""
+
+
 class Account:
     """The memory, in bytes, that one file has used so far, and its limit."""
 
@@ -56,9 +61,9 @@ class Account:
         # A file is held as a whole while arrays are made of it: half as much again,
         # so that a file of nearly the largest size cannot take twice its size.
         self.left = max_bytes * 3 // 2
-        self.steps = 5_000_000 + disk_bytes
+        self.steps = FREE_STEPS + disk_bytes
         """Instructions of pickles: each takes a byte at least, so only those of a
-        compressed file can be more than its bytes; 5 million take two seconds."""
+        compressed file can be more than its bytes."""
 
     def check(self, size: int, what: str) -> None:
         """Checks that one object alone is within the budget.
