@@ -143,6 +143,9 @@ def meet(
     for _ in range(2):
         keep &= keep.sum(axis=0) >= 2
         view, point = np.nonzero(keep)
+        if not len(view):
+            nothing = np.full((*xy[0].shape[:2], 3), np.nan)
+            return nothing, np.full((len(xy), *xy[0].shape[:2]), np.nan)
         scale = most / 2 / TYPICAL_DEPTH
         points = triangulate(
             R[view], centre[view], seen[keep], point, count, scale
