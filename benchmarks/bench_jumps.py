@@ -23,28 +23,16 @@ from bodyslam_jax import evaluation, motion, pipeline, simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.geometry.stances import in_free_fall
-from bodyslam_jax.motion.capture.clips import leg_length
 from bodyslam_jax.simulation import sequences
 from bodyslam_jax.simulation.camera_paths import FPS, HANDLING, film_room
-from bodyslam_jax.simulation.gait_synthesis import Soles, Walk
+from bodyslam_jax.simulation.gait_synthesis import Soles
 from bodyslam_jax.simulation.posing import Person
+from bodyslam_jax.simulation.recorded import play
 from bodyslam_jax.simulation.room import furnish
 
 JUMPS = ("02_04", "13_11", "13_39")
 DISTANCE = 4.0
 """m"""
-
-
-def recorded(clip: motion.Clip, person: Person, frames: int) -> Walk:
-    """The clip in another person's size, whose soles stand at height 0; forwards and
-    backwards until it is long enough."""
-    there = np.arange(len(clip.poses))
-    again = np.resize(np.concatenate([there, there[-2:0:-1]]), frames)
-    poses, pelvis = clip.poses[again], clip.trans[again]
-    pelvis = pelvis * float(leg_length(person.rest) / clip.leg_length)
-    soles = Soles(person)(poses, pelvis)[..., 1].min(axis=1)
-    pelvis = pelvis - [0.0, np.quantile(soles, 0.2), 0.0]
-    return Walk(poses.astype(float), pelvis.astype(float))
 
 
 def scene(
@@ -54,7 +42,7 @@ def scene(
     seed = int(clip.name.replace("_", ""))
     truth, key, bodies, points = np.random.default_rng(seed).spawn(4)
     person = Person(load_body_model(), np.clip(truth.standard_normal(10), -2, 2))
-    walk = recorded(clip, person, frames)
+    walk = play(person, clip, frames, None)
     middle = walk.pelvis.mean(axis=0)
     away = DISTANCE + np.ptp(walk.pelvis[:, [0, 2]], axis=0).max() / 2
     turn = truth.uniform(0, 2 * np.pi)

@@ -7,10 +7,11 @@
 
 `measure` adds the rows that the file does not have; an interrupted run goes on. The
 parts are `tens` (the ten sequences of both families, rendered: from pixels, simulated
-keypoints, bodies), `contacts` (standing feet, from simulated bodies and keypoints),
-`floors` (level, slope, stairs, uneven, drift), `tripods` (one to three people before a
-camera that does not move), `jumps` (recorded ones; needs `--motion`) and `clips` (real
-videos of `--videos`, which have no truth: their figures of posture and ground).
+keypoints, bodies), `others` (the same of people who do something else than walk),
+`contacts` (standing feet, from simulated bodies and keypoints), `floors` (level, slope,
+stairs, uneven, drift), `tripods` (one to three people before a camera that does not
+move), `jumps` (recorded ones; needs `--motion`) and `clips` (real videos of `--videos`,
+which have no truth: their figures of posture and ground).
 
 `compare` pairs the rows of two files. An error is no worse if the mean of its paired
 differences is within one standard error of the difference, and it is no more than a
@@ -34,7 +35,7 @@ import numpy as np
 import bodyslam_jax
 
 Row = dict[str, Any]
-PARTS = ("tens", "contacts", "floors", "tripods", "jumps", "clips")
+PARTS = ("tens", "others", "contacts", "floors", "tripods", "jumps", "clips")
 TENS = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
 WORSE = 1.25
 """Ratio of an error after to that before, in one sequence, from which it is worse."""
@@ -99,7 +100,7 @@ POSTURE = {
 def errors_of(row: Row) -> dict[str, tuple[str, float]]:
     """Every error of a row, with its unit; those that are not finite are left out."""
     found: dict[str, tuple[str, float]] = {}
-    if row["part"] == "tens":
+    if row["part"] in ("tens", "others"):
         for name, (unit, value) in ERRORS.items():
             try:
                 found[name] = unit, float(value(row))
@@ -191,20 +192,28 @@ Task = tuple[str, str, str, Callable[[], Row]]
 """Part, input, sequence, and what computes the row."""
 
 
-def tens(options: argparse.Namespace) -> Iterator[Task]:
+def tens(
+    options: argparse.Namespace, part: str = "tens", motion: str | None = None
+) -> Iterator[Task]:
     from bodyslam_jax.config import Config, Experiment
     from bodyslam_jax.experiments import video
     from bodyslam_jax.experiments.scenario import simulations
 
     config = Config(overlay=False)
-    experiment = Experiment(frames=options.frames, family="both", seed=options.seed)
+    experiment = Experiment(
+        frames=options.frames, family="both", seed=options.seed, motion=motion
+    )
     for plain in simulations(experiment, options.sequences or TENS, ("room", "follow")):
         settings = video.filmed(plain)
         for which in video.INPUTS:
             row = lambda s=settings, w=which: video.video_row(
-                s, w, config, options.keep / "tens"
+                s, w, config, options.keep / part
             )
-            yield "tens", which, video.named(settings), row
+            yield part, which, video.named(settings), row
+
+
+def others(options: argparse.Namespace) -> Iterator[Task]:
+    yield from tens(options, "others", "other")
 
 
 def contacts(options: argparse.Namespace) -> Iterator[Task]:

@@ -13,6 +13,7 @@ from bodyslam_jax.experiments.detector import detection_figures
 from bodyslam_jax.experiments.plans import PLANS
 from bodyslam_jax.experiments.row_cache import fits
 from bodyslam_jax.experiments.video_table import write_video
+from bodyslam_jax.pipeline.stage_cache import fingerprint
 from bodyslam_jax.types import Keypoints
 
 NAMES = KEYPOINT_NAMES["body25"]
@@ -89,6 +90,29 @@ def test_difficulty_of_the_scenes_and_rows_of_the_plan(tmp_path):
     easy, hard = plan.jobs[0].key[0], plan.jobs[3].key[0]
     assert (easy.length, easy.people, easy.hiding, easy.readout) == (300, 1, False, 0)
     assert (hard.people, hard.hiding) == (2, True) and hard.readout > 0
+
+
+def test_rows_of_other_motion_say_what_is_done_and_have_a_table_of_their_own(tmp_path):
+    other = Experiment(sequences=("M3",), family="room", motion=simulation.OTHER)
+    plan = PLANS["video"](other, Config(), tmp_path)
+    walk = PLANS["video"](
+        dataclasses.replace(other, motion=None), Config(), tmp_path / "stages"
+    )
+    assert [job.label for job in plan.jobs] == [job.label for job in walk.jobs]
+    assert [job.key[0].motion for job in plan.jobs] == ["other"] * 3
+    assert fingerprint(*plan.jobs[0].key) != fingerprint(*walk.jobs[0].key)
+    done = "climbs a ladder (14_33)"
+    assert [job.form["motion"] for job in plan.jobs] == [done] * 3
+    assert "motion" not in walk.jobs[0].form
+    row = {"sequence": "M3-room", "status": "ok", "size": 1.0}
+    row |= dict.fromkeys(video.FIGURES, 0.5)
+    rows = [row | {"input": which} for which in video.INPUTS]
+    written = walk.write(tmp_path, rows)
+    written += plan.write(tmp_path, [one | {"motion": done} for one in rows])
+    names = ["video.md", "video.csv", "video-other.md", "video-other.csv"]
+    assert [path.name for path in written] == names
+    assert f"| M3-room | {done} | pixels |" in written[2].read_text()
+    assert "ladder" not in written[0].read_text()
 
 
 @pytest.mark.slow

@@ -19,7 +19,8 @@ class Simulation:
     """Random seed. Without it, that of the sequence."""
     motion: str | None = None
     """Motion data that the walkers use (CMU archive, AMASS, BVH). Without it, the clips
-    of the package."""
+    of the package. `other`: recordings of the package in which the first person does
+    something else than walk."""
     noise: Literal["none", "low", "real"] = "real"
     """Level of errors of all measurements, unless set individually below."""
     keypoint_noise: Literal["none", "low", "real"] | None = None
@@ -75,7 +76,8 @@ class Experiment:
     """Errors of all measurements."""
     motion: str | None = None
     """Motion data that walkers use (CMU archive, AMASS, BVH). Without it, the clips of
-    the package."""
+    the package. `other`: recordings of the package in which the first person does
+    something else than walk; sits, climbs, jumps, dribbles, waves, and the like."""
     seed: int | None = None
     """Random seed, combined with the sequence's name. Without it, the name alone."""
     motion_models: tuple[str, ...] = ()

@@ -14,7 +14,7 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.experiments.row_cache import Row
 from bodyslam_jax.experiments.scenario import simulations
 from bodyslam_jax.pipeline.case import Case, simulate_case
-from bodyslam_jax.simulation import LENGTH
+from bodyslam_jax.simulation import LENGTH, motion_file
 
 FRONT_END_S_PER_FRAME, SOLVE_S_PER_FRAME, COMPILATION_S = 0.15, 0.08, 25.0
 """Processor time on a 2.5 GHz core: of the stages before the joint estimate, of a solve
@@ -53,7 +53,7 @@ def check_files(experiment: Experiment, config: Config) -> None:
             f"--frames {experiment.frames}: a sequence needs 2 frames or more."
         )
     if experiment.motion is not None:
-        source = Path(experiment.motion)
+        source = motion_file(experiment.motion)
         if not source.is_dir():  # a folder may be large, and is read when it is needed
             motion.read_motion(source)
     body = body_.load_body_model(config.body_model)

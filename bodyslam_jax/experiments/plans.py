@@ -39,6 +39,7 @@ from bodyslam_jax.experiments.weights import (
 )
 from bodyslam_jax.pipeline.case import Case
 from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
+from bodyslam_jax.simulation import motion_file
 
 ALL_SEQUENCES = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
 NOISE_LEVELS = ("none", "low", "real")
@@ -109,7 +110,7 @@ def landmarks(experiment: Experiment, config: Config, stages: Path) -> Plan:
 def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
     """Plans the prediction errors of the motion model on clips it was not trained
     on."""
-    source = experiment.motion or str(reports.CLIPS_FILE)
+    source = str(motion_file(experiment.motion))
 
     def compute() -> Row:
         model = motion.load_motion_model(config.motion_model)

@@ -7,7 +7,7 @@ import functools
 from pathlib import Path
 
 from bodyslam_jax import body as body_
-from bodyslam_jax import motion, simulation
+from bodyslam_jax import motion
 from bodyslam_jax.config import Config, Experiment
 from bodyslam_jax.experiments import figures, paper
 from bodyslam_jax.experiments.provenance import deviations
@@ -21,7 +21,6 @@ from bodyslam_jax.experiments.tables import (
     write_text,
 )
 
-CLIPS_FILE = Path(simulation.__file__).parent / "assets" / "walking.npz"
 """File of the clips that are part of the package."""
 SCALE_FORM = {
     **dict.fromkeys(("perturbation", "scale", "deviation"), [float]),

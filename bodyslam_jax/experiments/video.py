@@ -4,6 +4,9 @@ Every sequence is rendered with people in clothes; medium ones have furniture th
 occludes them, difficult ones also a second person and a rolling shutter. Inputs of the
 pipeline are the video and camera.json, and: nothing else (`pixels`); simulated
 keypoints (`keypoints`); or these and simulated bodies of a regressor (`bodies`).
+
+With `motion="other"` the first person does something else than walk, in each of the ten
+sequences something else; a second person walks.
 """
 
 import dataclasses
@@ -20,6 +23,7 @@ from bodyslam_jax.experiments.row_cache import Row
 from bodyslam_jax.experiments.scenario import simulations
 from bodyslam_jax.experiments.scoring import leg_of
 from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint
+from bodyslam_jax.simulation import OTHER, RECORDINGS
 
 INPUTS = ("pixels", "keypoints", "bodies")
 FRAMES = 300
@@ -52,10 +56,19 @@ def jobs(
         for which in INPUTS:
             label = f"{named(settings)}-{which}"
             form = {"sequence": named(settings), **FORM, "input": which}
+            if settings.motion == OTHER:
+                form["motion"] = what_is_done(settings)
             seconds = COMPILATION_S + _SECONDS_PER_FRAME * (settings.length or FRAMES)
             one = functools.partial(video_row, settings, which, config, stages)
             out.append(Job(label, (settings, which, config), seconds, one, form))
     return out
+
+
+def what_is_done(settings: Simulation) -> str:
+    """Returns what the first person does, and the CMU trial of it, where they do not
+    walk."""
+    trial, what = RECORDINGS[settings.sequence]
+    return f"{what} ({trial})"
 
 
 def filmed(settings: Simulation) -> Simulation:
@@ -87,6 +100,8 @@ def video_row(
     sequence, measured = io.read_sequence(film), simulation.as_sequence(simulated)
     cache = Cache(folder / which)
     row: Row = {"sequence": simulated.name, "input": which}
+    if settings.motion == OTHER:
+        row["motion"] = what_is_done(settings)
     if which == "pixels":
         sequence = pipeline.find_people(sequence, config, cache)
         row |= detection_figures(simulated, sequence)

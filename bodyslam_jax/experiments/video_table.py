@@ -41,19 +41,30 @@ _FIGURES = (
     Column("joints' acceleration, m/s²", "joint_acceleration"),
     Column("gravity error, degrees", "gravity_error", _DEGREES, 2),
 )
+_OTHER = (
+    " The first person does what `motion` says (a CMU trial, played forwards and "
+    "backwards), a second one walks. Neither the posture prior nor the lifting network "
+    "that ship learnt from the people of these trials."
+)
 _TRUTH_FIGURES = {name: f"{name}_of_truth" for name in FIGURES}
 """Keys of the figures that are computed for the truth as well."""
 
 
 def write_video(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     """Writes `video.md` and `video.csv`: means, every sequence, the detector's
-    keypoints."""
+    keypoints.
+
+    Rows of people who do something else than walk are written to `video-other.md` and
+    `.csv` beside these.
+    """
     rows = [
         row | {"scale_error": None if row["scale"] is None else abs(1 - row["scale"])}
         for row in rows
     ]
+    others = [Column("motion", "motion")] if any("motion" in r for r in rows) else []
+    title = "From pixels alone, beside simulated keypoints and bodies"
     text = intro(
-        "From pixels alone, beside simulated keypoints and bodies",
+        f"{title}: other motion than walking" if others else title,
         about,
         "People in clothes are rendered; in medium sequences (M) furniture hides them "
         "for a while, in difficult ones (D) there is a second person and a rolling "
@@ -62,7 +73,8 @@ def write_video(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         "keypoints, noise as above; `bodies`: these and bodies as of a regressor. "
         "Means over sequences ± their standard errors. Errors are means over frames; "
         "the lowest point is the lowest of ankles and toes, the standing foot the "
-        "lower of both in each frame (horizontal, median).",
+        "lower of both in each frame (horizontal, median)."
+        + (_OTHER if others else ""),
     )
     families = dict.fromkeys(row["sequence"].split("-")[1] for row in rows)
     for family in families:
@@ -70,16 +82,18 @@ def write_video(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         text += f"## Family `{family}`: means\n\n{_summary(own)}\n"
     for family in families:
         own = [row for row in rows if row["sequence"].endswith(family)]
-        columns = [Column("sequence", "sequence"), Column("input", "input"), *_FIGURES]
-        columns.append(Column("status", "status"))
+        columns = [Column("sequence", "sequence"), *others, Column("input", "input")]
+        columns += [*_FIGURES, Column("status", "status")]
         text += f"## Family `{family}`: every sequence\n\n{markdown(columns, own)}\n"
     text += f"## The detector's keypoints\n\n{keypoint_table(rows)}"
-    write_text(out / "video.md", text)
-    columns = [Column("sequence", "sequence"), Column("input", "input"), *_FIGURES]
+    name = "video-other" if others else "video"
+    write_text(out / f"{name}.md", text)
+    columns = [Column("sequence", "sequence"), *others, Column("input", "input")]
+    columns += _FIGURES
     columns += [Column(f"true {c.title}", _TRUTH_FIGURES[c.key], c.factor, c.digits)
                 for c in _FIGURES if c.key in _TRUTH_FIGURES]  # fmt: skip
-    write_text(out / "video.csv", to_csv(columns, rows, about))
-    return [out / "video.md", out / "video.csv"]
+    write_text(out / f"{name}.csv", to_csv(columns, rows, about))
+    return [out / f"{name}.md", out / f"{name}.csv"]
 
 
 def _summary(rows: Sequence[Row]) -> str:

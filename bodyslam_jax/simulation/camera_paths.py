@@ -41,6 +41,11 @@ HANDLING = {
 }
 
 
+_FOLLOWING_DISTANCE_M = 3.7
+_AROUND_SPEED = 1.1
+"""Speed of a camera that walks around somebody, m/s: a slow walk."""
+
+
 def smooth_noise(
     rng: np.random.Generator, num_frames: int, seconds: float, width: int = 1
 ) -> Float[np.ndarray, "t {width}"]:
@@ -105,13 +110,36 @@ def film_following(
 ) -> Float[np.ndarray, "t 4 4"]:
     """Returns the poses (camera to world) of a camera that follows the `person`, behind
     or beside, at 3 to 4.5 m."""
-    t = len(person)
     smooth = gaussian_filter1d(person, 0.6 * FPS, axis=0, mode="nearest")
     heading = np.gradient(gaussian_filter1d(smooth, 1.2 * FPS, axis=0), axis=0)
     yaw = np.unwrap(np.arctan2(heading[:, 0], heading[:, 2]))
+    return _film_from(yaw, person, handling, rng)
+
+
+def film_around(
+    person: Float[np.ndarray, "t 3"], handling: Handling, rng: np.random.Generator
+) -> Float[np.ndarray, "t 4 4"]:
+    """Returns the poses (camera to world) of a camera that walks around a `person` who
+    stays about where they are, at 3 to 4.5 m."""
+    rate = rng.choice([-1, 1]) * _AROUND_SPEED / _FOLLOWING_DISTANCE_M / FPS
+    yaw = rng.uniform(0, 2 * np.pi) + rate * np.arange(len(person))
+    return _film_from(yaw, person, handling, rng)
+
+
+def _film_from(
+    yaw: Float[np.ndarray, " t"],
+    person: Float[np.ndarray, "t 3"],
+    handling: Handling,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "t 4 4"]:
+    """Returns the poses of a camera behind or beside a person who heads for `yaw` (rad,
+    from z to x)."""
+    t = len(person)
+    smooth = gaussian_filter1d(person, 0.6 * FPS, axis=0, mode="nearest")
     side = rng.choice([-1, 1]) * rng.uniform(0.3, 1.2)
     yaw = yaw + np.pi + side + handling.swing * smooth_noise(rng, t, 2.5)[:, 0]
-    distance = 3.7 + 0.35 * np.clip(smooth_noise(rng, t, 2.5)[:, 0], -2, 2)
+    distance = _FOLLOWING_DISTANCE_M
+    distance = distance + 0.35 * np.clip(smooth_noise(rng, t, 2.5)[:, 0], -2, 2)
     eye = smooth + distance[:, None] * np.stack(
         [np.sin(yaw), np.zeros(t), np.cos(yaw)], axis=1
     )

@@ -15,6 +15,7 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.motion import FPS, Clip, read_motion
 from bodyslam_jax.simulation.camera_paths import (
     HANDLING,
+    film_around,
     film_following,
     film_room,
     floor_path,
@@ -22,6 +23,7 @@ from bodyslam_jax.simulation.camera_paths import (
 from bodyslam_jax.simulation.gait_synthesis import Walk, walk_along, walking_clips
 from bodyslam_jax.simulation.point_tracks import is_behind, track_points
 from bodyslam_jax.simulation.posing import Person
+from bodyslam_jax.simulation.recorded import OTHER, RECORDINGS, play
 from bodyslam_jax.simulation.room import Room, furnish, put_in_the_way
 from bodyslam_jax.simulation.sensor_noise import (
     NOISE,
@@ -184,7 +186,9 @@ def simulate(
     seed = _seed_of(settings)
     # Separate streams, so that the noise level does not change the truth.
     truth, key, reg, pts = np.random.default_rng(seed).spawn(4)
-    source = settings.motion or str(ASSETS / "walking.npz")
+    does_other = settings.motion == OTHER
+    walks_of = None if does_other else settings.motion
+    source = str(motion_file(walks_of))
     clips = walking_clips(read_motion(source), source)
 
     shape = np.clip(truth.standard_normal(10), -2.0, 2.0)
@@ -192,9 +196,17 @@ def simulate(
     handling = HANDLING[settings.sequence[0]]
     around = settings.sequence in _SEQUENCES_AROUND_CAMERA
     path, place = floor_path(settings.family, around, truth)
-    walk = walk_along(person, clips, path, num_frames, truth)
+    if does_other:
+        trials = {clip.name: clip for clip in read_motion(motion_file(OTHER))}
+        along = np.arctan2(*(path[1] - path[0]))
+        clip = trials[RECORDINGS[settings.sequence][0]]
+        walk = play(person, clip, num_frames, path[0], along)
+    else:
+        walk = walk_along(person, clips, path, num_frames, truth)
     if settings.family == "room":
         T_WC = film_room(walk.pelvis, place, handling, truth)
+    elif does_other:
+        T_WC = film_around(walk.pelvis, handling, truth)
     else:
         T_WC = film_following(walk.pelvis, handling, truth)
     others = [
@@ -212,6 +224,13 @@ def simulate(
         rng = np.random.default_rng([seed, 100])
         room = put_in_the_way(room, [w.pelvis for w in walks], T_WC[:, :3, 3], rng)
     return measure(settings, name, person, walk, T_WC, room, (key, reg, pts), others)
+
+
+def motion_file(motion: str | None) -> Path:
+    """Returns the file or folder of motion that `Simulation.motion` means."""
+    if motion is None:
+        return ASSETS / "walking.npz"
+    return ASSETS / "other.npz" if motion == OTHER else Path(motion)
 
 
 def _seed_of(settings: Simulation) -> int:
