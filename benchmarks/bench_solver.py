@@ -41,7 +41,7 @@ from bodyslam_jax.solver import Stage, marginalise, solve, vmap_over_devices
 from bodyslam_jax.solver.block_cholesky import factorise
 from bodyslam_jax.solver.blocks import cast, sizes_of
 from bodyslam_jax.solver.elimination.person import eliminate_people
-from bodyslam_jax.solver.elimination.schur import eliminate_landmarks
+from bodyslam_jax.solver.elimination.schur import eliminate_landmarks, half_inverses
 from bodyslam_jax.solver.front import window_of
 from bodyslam_jax.solver.linear_system import Eliminated, damped, diagonals, solve_step
 from bodyslam_jax.solver.linearise import linearise
@@ -91,14 +91,9 @@ def breakdown(problem, state, mixed, repeats):
     part("what keypoints bend", bent, problem, lin, state)
     damping = damped(diagonals(lin, sizes), jnp.asarray(1e-4, state.scale.dtype))
     lin, damping = cast((lin, damping), sizes.dtype)
-    reduced = part(
-        "landmarks",
-        eliminate_landmarks,
-        problem,
-        lin.landmarks,
-        damping["landmarks"],
-        sizes,
-    )
+    halves = half_inverses(lin.landmarks, damping["landmarks"])
+    given = problem, lin.landmarks, halves, damping["landmarks"], sizes
+    reduced = part("landmarks", eliminate_landmarks, *given)
     people, window = None, window_of(lin, sizes)
     if sizes.people:
         people = part("people", eliminate_people, lin, sizes, window, damping)
@@ -106,7 +101,7 @@ def breakdown(problem, state, mixed, repeats):
     given = lin, sizes, reduced, kept, window, damping, problem.layout.order
     chunks = part("assembly", assemble, *given)
     factor = part("factorisation", factorise, chunks, sizes, problem.layout)
-    whole = Eliminated(damping, window, people, factor)
+    whole = Eliminated(halves, window, people, factor)
     part("back-substitution", solve_step, problem, state, lin, sizes, whole)
 
 

@@ -6,8 +6,10 @@ a person who stands upright before an OpenCV camera is; types are kept (float32 
 float64). `so3_numpy` has the same functions for stages that work in NumPy.
 """
 
+import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Float
 
 _SMALL_SQUARED_ANGLE = 1e-3
@@ -22,9 +24,7 @@ def exp(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
 
     `R = I + a [θ]x + b [θ]x²` with `a = sin|θ| / |θ|`, `b = (1 - cos|θ|) / |θ|²`.
     """
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    xx, yy, zz = x * x, y * y, z * z
-    squared = xx + yy + zz
+    squared = _squared(vector)
     small = squared < _SMALL_SQUARED_ANGLE
     safe = jnp.where(small, 1.0, squared)
     half = 0.5 * jnp.sqrt(safe)
@@ -34,14 +34,9 @@ def exp(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
     b_series = 0.5 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90))))
     a = jnp.where(small, a_series, sine * cosine / half)
     b = jnp.where(small, b_series, 2 * sine * sine / safe)
-    xy, xz, yz = b * x * y, b * x * z, b * y * z
-    ax, ay, az = a * x, a * y, a * z
-    rows = [
-        [1 - b * (yy + zz), xy - az, xz + ay],
-        [xy + az, 1 - b * (xx + zz), yz - ax],
-        [xz - ay, yz + ax, 1 - b * (xx + yy)],
-    ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    a, b = a[..., None, None], b[..., None, None]
+    eye = jnp.eye(3, dtype=vector.dtype)
+    return (1 - b * s[..., None, None]) * eye + (a * _skew(vector) + b * _outer(vector))
 
 
 def log(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
@@ -50,13 +45,16 @@ def log(rotation: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
     At π, where the vector jumps to its opposite, the derivative is that of the returned
     branch.
     """
-    return _log_quaternion(jaxlie.SO3.from_matrix(rotation).wxyz)
+    return _log_quaternion(_quaternion_of_matrix(rotation))
 
 
 def compose(
     first: Float[Array, "*#b 3"], second: Float[Array, "*#b 3"]
 ) -> Float[Array, "*b 3"]:
     """Returns `Log(Exp(first) Exp(second))`, with `second` in the rotated frame."""
+    if first.shape == second.shape:
+        both = _quaternion(jnp.stack([first, second]))
+        return _log_quaternion(_product(both[0], both[1]))
     return _log_quaternion(_product(_quaternion(first), _quaternion(second)))
 
 
@@ -89,23 +87,92 @@ def from_quaternion(xyzw: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
 
 def inverse_right_jacobian(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
     """Returns `d Log(Exp(θ) Exp(δ)) / dδ` at δ = 0; finite for angles below 2π."""
-    squared = jnp.sum(vector**2, axis=-1)[..., None, None]
+    squared = _squared(vector)
     small = squared < 1e-4
     safe = jnp.where(small, 1.0, squared)
     half = 0.5 * jnp.sqrt(safe)
     factor = (1 - half * jnp.cos(half) / jnp.sin(half)) / safe
     factor = jnp.where(small, 1 / 12 + squared / 720, factor)
-    x, y, z = (vector[..., i] for i in range(3))
-    zero = jnp.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    skew = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    along = (1 - factor * squared)[..., None, None]
     eye = jnp.eye(3, dtype=vector.dtype)
-    return eye + 0.5 * skew + factor * (skew @ skew)
+    bent = 0.5 * _skew(vector) + factor[..., None, None] * _outer(vector)
+    return along * eye + bent
+
+
+# Sums of products with constants, not stacks of entries: XLA makes one loop of a sum,
+# and one of each entry of a stack.
+
+_SKEW = -np.array(
+    [
+        [[0, 0, 0], [0, 0, 1], [0, -1, 0]],
+        [[0, 0, -1], [0, 0, 0], [1, 0, 0]],
+        [[0, 1, 0], [-1, 0, 0], [0, 0, 0]],
+    ]
+)
+"""`[e_i]x` of the three axes."""
+
+
+def _skew(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+    """Returns `[θ]x`."""
+    basis = jnp.asarray(_SKEW, vector.dtype)
+    x, y, z = (vector[..., i, None, None] * basis[i] for i in range(3))
+    return x + y + z
+
+
+def _outer(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+    """Returns `θ θ^T`, which is `[θ]x² + |θ|² I`."""
+    return vector[..., :, None] * vector[..., None, :]
+
+
+def _squared(vector: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
+    return vector[..., 0] ** 2 + vector[..., 1] ** 2 + vector[..., 2] ** 2
 
 
 def _quaternion(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
-    """Converts rotation vectors to unit quaternions (w, x, y, z)."""
-    return jaxlie.SO3.exp(vector).wxyz
+    """Converts rotation vectors to unit quaternions (w, x, y, z), `w = cos(|θ| / 2)`
+    and `(x, y, z) = sin(|θ| / 2) θ / |θ|`."""
+    s = _squared(vector)
+    small = s < _SMALL_SQUARED_ANGLE
+    half = 0.5 * jnp.sqrt(jnp.where(small, 1.0, s))
+    w_series = 1 - s / 8 * (1 - s / 48 * (1 - s / 120))
+    share_series = 0.5 - s / 48 * (1 - s / 80 * (1 - s / 168))
+    w = jnp.where(small, w_series, jnp.cos(half))
+    share = jnp.where(small, share_series, 0.5 * jnp.sin(half) / half)
+    return jnp.concatenate([w[..., None], share[..., None] * vector], axis=-1)
+
+
+def _coefficients() -> Float[np.ndarray, "9 16"]:
+    """Returns the coefficients of the entries of R in `4 q q^T - I`."""
+    found = np.zeros((3, 3, 4, 4))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        x, y = 1 + i, 1 + j
+        found[i, i] = np.diag([1.0 if n in (0, x) else -1.0 for n in range(4)])
+        # R_kj - R_jk = 4 w q_i and R_ij + R_ji = 4 q_i q_j
+        found[k, j, [0, x], [x, 0]], found[j, k, [0, x], [x, 0]] = 1.0, -1.0
+        found[i, j, [x, y], [y, x]] = found[j, i, [x, y], [y, x]] = 1.0
+    return found.reshape(9, 16)
+
+
+_COEFFICIENTS = _coefficients()
+
+
+def _quaternion_of_matrix(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
+    """Converts rotation matrices to unit quaternions (w, x, y, z) of either sign.
+
+    The entries of `4 q q^T` are linear in those of R; the quaternion is the row with
+    the largest entry on the diagonal, divided by its root (Shepperd, 1978).
+    """
+    linear = jnp.asarray(_COEFFICIENTS, R.dtype)
+    flat = R.reshape(*R.shape[:-2], 9)
+    outer = jnp.matmul(flat, linear, precision=jax.lax.Precision.HIGHEST)
+    eye = jnp.eye(4, dtype=R.dtype)
+    outer = outer.reshape(*R.shape[:-2], 4, 4) + eye
+    square = jnp.sum(outer * eye, axis=-1)
+    picked = jnp.arange(4) == jnp.argmax(square, axis=-1)[..., None]
+    row = jnp.sum(jnp.where(picked[..., None], outer, 0.0), axis=-2)
+    square = jnp.sum(jnp.where(picked, square, 0.0), axis=-1)
+    return 0.5 * row / jnp.sqrt(square)[..., None]
 
 
 def _product(
@@ -132,11 +199,12 @@ def _log_quaternion(wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
     The logarithm of jaxlie is constant near π, so that its derivative with respect to a
     further rotation about the axis vanishes there.
     """
-    q = jnp.where(wxyz[..., :1] < 0, -wxyz, wxyz)
-    w, v = q[..., :1], q[..., 1:]
-    squared = jnp.sum(v**2, axis=-1, keepdims=True)
+    w, v = wxyz[..., 0], wxyz[..., 1:]
+    sign = jnp.where(w < 0, -1.0, 1.0).astype(w.dtype)
+    w, squared = sign * w, _squared(v)
     small = squared < _SMALL_SQUARED_SINE
     size = jnp.sqrt(jnp.where(small, 1.0, squared))
     near = jnp.maximum(w, 0.5)  # w is about 1 where the series is used
     series = 2 / near - 2 * squared / (3 * near**3)
-    return v * jnp.where(small, series, 2 * jnp.arctan2(size, w) / size)
+    share = sign * jnp.where(small, series, 2 * jnp.arctan2(size, w) / size)
+    return share[..., None] * v

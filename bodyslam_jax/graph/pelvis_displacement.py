@@ -26,27 +26,28 @@ def displacement(previous: Frame, now: Frame, scale: Array) -> Float[Array, " 3"
     return previous.root[:3, :3].T @ (previous.camera[:3, :3].T @ moved)
 
 
-def displacements(
+def displacements(state: State) -> Float[Array, "h t 3"]:
+    """Returns `d` of all people and frames, m."""
+    C_HW_1, _, moved = _moved(state)
+    return _rotate(C_HW_1, moved)
+
+
+def displacements_with_derivatives(
     state: State,
 ) -> tuple[Float[Array, "h t 3"], dict[str, Float[Array, "h t 3 _"]]]:
     """Returns `d` in m, and its derivatives by camera and root of this frame (`camera`,
     `root`) and of the previous one (`camera_1`, `root_1`), and by the scale."""
+    C_HW_1, shift, moved = _moved(state)
     camera = jnp.broadcast_to(state.cameras, state.roots.shape)
-    s = state.scale
-    C, r_WC = camera[..., :3, :3], camera[..., :3, 3]
-    r_CH, C_CH = state.roots[..., :3, 3], state.roots[..., :3, :3]
+    C, r_CH, s = camera[..., :3, :3], state.roots[..., :3, 3], state.scale
     C_1, r_1 = previous_frame(C), previous_frame(r_CH)
-    C_HC_1 = previous_frame(C_CH).swapaxes(-1, -2)
-    C_HW_1 = C_HC_1 @ C_1.swapaxes(-1, -2)
-    rotate = lambda matrix, v: jnp.einsum("...ij,...j->...i", matrix, v)
-    shift = r_WC - previous_frame(r_WC)
-    moved = s * shift + rotate(C, r_CH) - rotate(C_1, r_1)
-    d = rotate(C_HW_1, moved)
+    C_HC_1 = previous_frame(state.roots[..., :3, :3]).swapaxes(-1, -2)
+    d = _rotate(C_HW_1, moved)
     # C Exp(ω) r = C r - C [r]x ω, and (C Exp(ω))^T w = C^T w + [C^T w]x ω
-    by_rotation = C_HW_1 @ _by_rotation(C, r_CH)
-    by_rotation_1 = -C_HW_1 @ _by_rotation(C_1, r_1)
+    by_rotation = C_HW_1 @ by_rotation_of(C, r_CH)
+    by_rotation_1 = -C_HW_1 @ by_rotation_of(C_1, r_1)
     by_rotation_1 = by_rotation_1 + C_HC_1 @ _cross_matrix(
-        rotate(C_1.swapaxes(-1, -2), moved)
+        _rotate(C_1.swapaxes(-1, -2), moved)
     )
     zero = jnp.zeros_like(by_rotation)
     join = lambda *parts: jnp.concatenate(parts, axis=-1)
@@ -55,11 +56,35 @@ def displacements(
         "camera_1": join(by_rotation_1, -s * C_HW_1),
         "root": join(zero, C_HW_1 @ C),
         "root_1": join(_cross_matrix(d), -C_HW_1 @ C_1),
-        "scale": rotate(C_HW_1, shift)[..., None],
+        "scale": _rotate(C_HW_1, shift)[..., None],
     }
 
 
-def _by_rotation(C: Float[Array, "*b 3 3"], r: Float[Array, "*b 3"]) -> Array:
+def _moved(state: State) -> tuple[Array, Array, Float[Array, "h t 3"]]:
+    """Returns C_HW of the previous frame, the displacement of the camera (units of the
+    map), and that of the pelvis in the world, m."""
+    camera = jnp.broadcast_to(state.cameras, state.roots.shape)
+    C, r_WC = camera[..., :3, :3], camera[..., :3, 3]
+    r_CH, C_CH = state.roots[..., :3, 3], state.roots[..., :3, :3]
+    C_1 = previous_frame(C)
+    C_HW_1 = previous_frame(C_CH).swapaxes(-1, -2) @ C_1.swapaxes(-1, -2)
+    shift = r_WC - previous_frame(r_WC)
+    moved = state.scale * shift + _rotate(C, r_CH)
+    return C_HW_1, shift, moved - _rotate(C_1, previous_frame(r_CH))
+
+
+def pelvis_in_world(state: State) -> Float[Array, "h t 3"]:
+    """Returns `r_WH = s r'_WC + C_WC r_CH`, m."""
+    camera = jnp.broadcast_to(state.cameras, state.roots.shape)
+    turned = _rotate(camera[..., :3, :3], state.roots[..., :3, 3])
+    return state.scale * camera[..., :3, 3] + turned
+
+
+def _rotate(matrix: Float[Array, "*b 3 3"], v: Float[Array, "*b 3"]) -> Array:
+    return jnp.einsum("...ij,...j->...i", matrix, v)
+
+
+def by_rotation_of(C: Float[Array, "*b 3 3"], r: Float[Array, "*b 3"]) -> Array:
     """Returns `d (C Exp(ω) r) / dω = -C [r]x`: each row is a cross product."""
     return jnp.cross(jnp.broadcast_to(r[..., None, :], C.shape), C)
 

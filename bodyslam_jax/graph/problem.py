@@ -145,13 +145,14 @@ class Problem(eqx.Module):
         if self.motion is None:
             return None
         found = self.motion(jax.lax.stop_gradient(state) if frozen else state)
-        return {
-            "translation": found.translation,
+        prediction = {
             "leg": leg_length(self.motion.body, state.shapes)[:, None, None],
-            "rotation": found.rotation,
-            "body_pose": found.body_pose,
             "valid": getattr(found, "valid", None),
         }
+        # What no factor takes is left out, so that it is not computed.
+        for name in {_predicted_by(factor) for factor in self.factors} - {None}:
+            prediction[name] = getattr(found, name)
+        return prediction
 
     def with_prediction(self, prediction: Any) -> "Problem":
         """Returns the problem with a prediction (`predict`) in its factors; they keep
@@ -266,21 +267,32 @@ class Problem(eqx.Module):
         )
 
 
+def _predicted_by(factor: Factor) -> str | None:
+    """Returns the name of the prediction that a factor takes, if it takes one."""
+    if isinstance(factor, Masked):
+        return _predicted_by(factor.factor)
+    if isinstance(factor, HumanMotion):
+        return "translation"
+    if isinstance(factor, RelativeOrientation):
+        return "rotation"
+    if isinstance(factor, BodyPosePrior) and factor.predicted:
+        return "body_pose"
+    return None
+
+
 def _with_prediction(factor: Factor, prediction: dict[str, Array]) -> Factor:
     """Returns the factor with its predicted measurements replaced, if it has any."""
     if isinstance(factor, Masked):
         inner = _with_prediction(factor.factor, prediction)
         return eqx.tree_at(lambda f: f.factor, factor, inner)
-    if isinstance(factor, HumanMotion) and "translation" in prediction:
+    name = _predicted_by(factor)
+    if name not in prediction:
+        return factor
+    if isinstance(factor, HumanMotion):
         unit = 1 if factor.body is None else prediction["leg"]
-        translation = prediction["translation"] / unit
-        return _predicted(factor, "translation", translation, prediction)
-    if isinstance(factor, RelativeOrientation) and "rotation" in prediction:
-        return _predicted(factor, "rotation", prediction["rotation"], prediction)
-    predicted_pose = isinstance(factor, BodyPosePrior) and factor.predicted
-    if predicted_pose and "body_pose" in prediction:
-        return _predicted(factor, "rotation", prediction["body_pose"], prediction)
-    return factor
+        value = prediction["translation"] / unit
+        return _predicted(factor, "translation", value, prediction)
+    return _predicted(factor, "rotation", prediction[name], prediction)
 
 
 def _predicted(factor: Factor, name: str, value: Array, prediction: Any) -> Factor:

@@ -44,5 +44,15 @@ def straightened(
     up = jnp.array([0.0, 1.0, 0.0], rate.dtype)
     step = so3.inverse(orientation[:-1]) @ orientation[1:]
     step = so3.exp(-rate[1:, None] * up) @ step
-    first = orientation[:1]
-    return jax.lax.associative_scan(jnp.matmul, jnp.concatenate([first, step]))
+    products = jnp.concatenate([orientation[:1], step])
+    frame = jnp.arange(len(products))
+
+    # Each pass doubles the number of factors. `associative_scan` would put every pass
+    # into the program, which takes longer to compile than to run.
+    def double(level, products):
+        back = frame - jnp.left_shift(jnp.ones_like(frame), level.astype(frame.dtype))
+        longer = products[jnp.maximum(back, 0)] @ products
+        return jnp.where((back >= 0)[:, None, None], longer, products)
+
+    passes = (len(products) - 1).bit_length()
+    return jax.lax.fori_loop(0, passes, double, products)

@@ -122,9 +122,10 @@ class Sums:
         self.blocks: dict[tuple[str, str, int], Array] = {}
         self.gradient: dict[str, Array] = {}
         self.costs: list[Array] = []
+        self._of_globals: dict[int | None, tuple[Array, Array]] = {}
         dtype = state.scale.dtype
-        self.globals = jnp.zeros((sizes.globals, sizes.globals), dtype)
-        self.globals_gradient = jnp.zeros(sizes.globals, dtype)
+        none = jnp.zeros((sizes.globals, sizes.globals), dtype)
+        self._all_globals = none, jnp.zeros(sizes.globals, dtype)
 
     def add(self, key: tuple[str, str, int], value: Array) -> None:
         value = value.astype(self.sizes.dtype)
@@ -137,9 +138,27 @@ class Sums:
 
     def add_globals(self, person: int | None, hessian: Array, gradient: Array) -> None:
         """Adds blocks over the globals of one person, or, with None, of no person."""
-        index = own_to_global(self.sizes, person)
-        self.globals = self.globals.at[index[:, None], index[None, :]].add(hessian)
-        self.globals_gradient = self.globals_gradient.at[index].add(gradient)
+        known = self._of_globals.get(person)
+        if known is not None:
+            hessian, gradient = known[0] + hessian, known[1] + gradient
+        self._of_globals[person] = hessian, gradient
+
+    def add_all_globals(self, hessian: Array, gradient: Array) -> None:
+        """Adds blocks over the globals of all people."""
+        known = self._all_globals
+        self._all_globals = known[0] + hessian, known[1] + gradient
+
+    def globals(self) -> tuple[Float[Array, "g g"], Float[Array, " g"]]:
+        """Returns the blocks over all globals, and their gradient."""
+        hessian, gradient = self._all_globals
+        for person, (own, slope) in self._of_globals.items():
+            if len(slope) == len(gradient):
+                hessian, gradient = hessian + own, gradient + slope
+                continue
+            index = own_to_global(self.sizes, person)
+            hessian = hessian.at[index[:, None], index[None, :]].add(own)
+            gradient = gradient.at[index].add(slope)
+        return hessian, gradient
 
 
 def shifted(x: Array, by: int, axis: int) -> Array:

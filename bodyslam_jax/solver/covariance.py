@@ -292,7 +292,7 @@ def _landmarks(problem, state, sizes, lin: Linearisation, damping, windows, arro
 def _from_cameras(bucket, table, damp, windows, sizes):
     """Returns `V^-1 + V^-1 W^T Σ W V^-1` of each landmark that was eliminated before
     the cameras, its covariance with the scale, and the variance of the scale."""
-    rows = half_inverse(table, damp)
+    rows = half_inverse(table.own, damp)
     zero = jnp.zeros_like(rows[0][0])
     half = jnp.stack(
         [jnp.stack(row + [zero] * (3 - len(row)), axis=1) for row in rows], axis=1

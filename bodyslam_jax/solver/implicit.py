@@ -67,7 +67,8 @@ def _program(alone: bool) -> Callable[..., Problem]:
 def _cotangent_of_problem(problem, state, cotangent):
     problem = _without_single_views(problem)
     zero = state.zero_step()
-    diagonal = diagonal_of(problem, state)
+    lin = normal_equations(problem, state)
+    diagonal = diagonal_of(problem, state, lin)
     masks = coordinates_of(problem, mask_of(problem))
     if problem.basis is not None:
         masks["poses"] = jnp.ones_like(diagonal["poses"])
@@ -95,7 +96,7 @@ def _cotangent_of_problem(problem, state, cotangent):
         return jax.grad(cost)(zero)
 
     _, transpose = jax.vjp(gradient, zero, arrays)
-    precondition = normal_solver(problem, state)
+    precondition = normal_solver(problem, state, lin)
     flat, unravel = ravel_pytree(right)
     scale, _ = ravel_pytree(unit)
 
@@ -152,11 +153,16 @@ def step_of(problem: Problem, x: Coordinates) -> Step:
     return Step(**{**x, "poses": to_turns(problem, x["poses"])})
 
 
-def diagonal_of(problem: Problem, state: State) -> Coordinates:
-    """Returns the diagonal of `J^T J`: 0 for coordinates that no measurement sees."""
+def normal_equations(problem: Problem, state: State) -> Linearisation:
+    """Returns the normal equations, with the motion predicted at `state`."""
     problem = problem.refresh(state)
+    return linearise(problem, gather(problem), state)
+
+
+def diagonal_of(problem: Problem, state: State, lin: Linearisation) -> Coordinates:
+    """Returns the diagonal of `J^T J`: 0 for coordinates that no measurement sees."""
     sizes = sizes_of(problem, state)
-    diagonal = diagonals(linearise(problem, gather(problem), state), sizes)
+    diagonal = diagonals(lin, sizes)
     zero = state.zero_step()
     count = sizes.intrinsics
     landmarks = zero.landmarks
@@ -179,12 +185,10 @@ def diagonal_of(problem: Problem, state: State) -> Coordinates:
 
 
 def normal_solver(
-    problem: Problem, state: State
+    problem: Problem, state: State, lin: Linearisation
 ) -> Callable[[Coordinates], Coordinates]:
     """Returns `v -> (J^T J)^-1 v`, barely damped, by the solver's own elimination."""
-    problem = problem.refresh(state)
     sizes = sizes_of(problem, state)
-    lin = linearise(problem, gather(problem), state)
     little = jnp.asarray(
         _PRECONDITIONER_DAMPING[state.scale.dtype.name], state.scale.dtype
     )

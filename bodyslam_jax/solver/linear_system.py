@@ -11,6 +11,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import Problem, State, Step
@@ -29,7 +30,9 @@ from bodyslam_jax.solver.elimination.person import (
     substitute_people,
 )
 from bodyslam_jax.solver.elimination.schur import (
+    Halves,
     eliminate_landmarks,
+    half_inverses,
     substitute_landmarks,
 )
 from bodyslam_jax.solver.front import Window, window_of
@@ -42,7 +45,7 @@ from bodyslam_jax.solver.reduced_system import Chunks, add_marginal_prior, assem
 class Eliminated(eqx.Module):
     """The factorised equations, with all that back-substitution needs."""
 
-    damping: dict
+    landmarks: tuple[Halves, ...]
     window: Window
     people: People | None
     factor: Factor
@@ -102,20 +105,27 @@ def eliminate(
 ) -> Eliminated:
     """Factorises the damped normal equations, in the precision of `sizes`."""
     lin, damping = cast((lin, damping), sizes.dtype)
-    chunks, window, people = reduce_to_chunks(problem, lin, sizes, damping)
+    halves = half_inverses(lin.landmarks, damping["landmarks"])
+    chunks, window, people = reduce_to_chunks(problem, lin, sizes, damping, halves)
     factor = factorise(chunks, sizes, problem.layout)
-    return Eliminated(damping, window, people, factor)
+    return Eliminated(halves, window, people, factor)
 
 
 def reduce_to_chunks(
-    problem: Problem, lin: Linearisation, sizes: Sizes, damping: dict
+    problem: Problem,
+    lin: Linearisation,
+    sizes: Sizes,
+    damping: dict,
+    halves: tuple[Halves, ...],
 ) -> tuple[Chunks, Window, People | None]:
-    """Eliminates landmarks, inner postures and inner roots.
+    """Eliminates landmarks, of which `halves` are the factors (`half_inverses`), inner
+    postures and inner roots.
 
     Returns the reduced system of chunks, the sizes of its groups, and what
     back-substitution needs of people.
     """
-    reduced = eliminate_landmarks(problem, lin.landmarks, damping["landmarks"], sizes)
+    given = lin.landmarks, halves, damping["landmarks"]
+    reduced = eliminate_landmarks(problem, *given, sizes)
     window = window_of(lin, sizes)
     people = None
     if sizes.people:
@@ -167,7 +177,7 @@ def solve_step(
     landmarks = substitute_landmarks(
         problem,
         lin.landmarks,
-        eliminated.damping["landmarks"],
+        eliminated.landmarks,
         as_they_stand,
         common[1 : 1 + i],
         move_lasting(problem, common[sizes.globals :], zero.landmarks),
@@ -185,36 +195,40 @@ def solve_step(
     return cast(Move(step, postures), state.scale.dtype)
 
 
-def quadratic(
-    problem: Problem, diagonal: dict, sizes: Sizes, move: Move
-) -> Float[Array, ""]:
-    """Returns `δ^T D δ` for a diagonal D."""
+def along(problem: Problem, sizes: Sizes, move: Move) -> Float[Array, " d"]:
+    """Returns all coordinates of a step in one vector, in the order of `in_line`."""
     step = move.step
-    total = jnp.sum(diagonal["camera"] * step.cameras**2)
-    total = total + jnp.sum(diagonal["root"] * step.roots**2)
-    total = total + jnp.sum(diagonal["globals"] * globals_of(step, sizes) ** 2)
-    if "pose" in diagonal:
-        total = total + jnp.sum(diagonal["pose"] * move.postures**2)
-    for bucket, own in zip(problem.layout.buckets, diagonal["landmarks"], strict=True):
-        moved = step.landmarks[bucket.landmark]
-        total = total + jnp.sum(own * jnp.moveaxis(moved, 2, 1) ** 2)
-    return total
+    landmarks = [
+        jnp.moveaxis(step.landmarks[bucket.landmark], 2, 1)
+        for bucket in problem.layout.buckets
+    ]
+    parts = [step.cameras, step.roots, globals_of(step, sizes), move.postures]
+    return _line(step.scale.dtype, [*parts, *landmarks])
 
 
-def slope_along(problem: Problem, lin: Linearisation, sizes: Sizes, move: Move):
-    """Returns `g^T δ`, the derivative of the cost along a step."""
-    step = move.step
-    total = jnp.sum(lin.globals_gradient * globals_of(step, sizes))
-    gradient = lin.gradient
-    if "camera_alone" in gradient:
-        total = total + jnp.sum(gradient["camera_alone"] * step.cameras)
+def in_line(
+    diagonal: dict, dtype: np.dtype, postures: Float[Array, "h t p"]
+) -> Float[Array, " d"]:
+    """Returns a diagonal in one vector; 0 for `postures` that no factor sees."""
+    pose = diagonal.get("pose", jnp.zeros_like(postures))
+    parts = [diagonal["camera"], diagonal["root"], diagonal["globals"], pose]
+    return _line(dtype, [*parts, *diagonal["landmarks"]])
+
+
+def gradient_in_line(
+    lin: Linearisation, sizes: Sizes, move: Move
+) -> Float[Array, " d"]:
+    """Returns the gradient in one vector, in the order of `in_line`."""
+    step, gradient = move.step, lin.gradient
+    camera = gradient.get("camera_alone", jnp.zeros_like(step.cameras))
     if "camera" in gradient:
-        total = total + jnp.sum(gradient["camera"] * step.cameras)
-    if "root" in gradient:
-        total = total + jnp.sum(gradient["root"] * step.roots)
-    if "pose" in gradient:
-        total = total + jnp.sum(gradient["pose"] * move.postures)
-    for bucket, table in zip(problem.layout.buckets, lin.landmarks, strict=True):
-        moved = jnp.moveaxis(step.landmarks[bucket.landmark], 2, 1)
-        total = total + jnp.sum(table.gradient * moved)
-    return total
+        camera = camera + jnp.sum(gradient["camera"], axis=0)
+    root = gradient.get("root", jnp.zeros_like(step.roots))
+    pose = gradient.get("pose", jnp.zeros_like(move.postures))
+    landmarks = [table.gradient for table in lin.landmarks]
+    parts = [camera, root, lin.globals_gradient, pose, *landmarks]
+    return _line(step.scale.dtype, parts)
+
+
+def _line(dtype: np.dtype, parts: list[Array]) -> Float[Array, " d"]:
+    return jnp.concatenate([x.astype(dtype).reshape(-1) for x in parts])

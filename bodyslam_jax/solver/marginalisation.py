@@ -45,6 +45,7 @@ from bodyslam_jax.solver.block_cholesky import Factor as Factorised
 from bodyslam_jax.solver.block_cholesky import factorise
 from bodyslam_jax.solver.blocks import CAMERAS, Sizes, mask_of, sizes_of
 from bodyslam_jax.solver.compilation import compiled, in_full_precision
+from bodyslam_jax.solver.elimination.schur import half_inverses
 from bodyslam_jax.solver.front import Window
 from bodyslam_jax.solver.linear_system import damped, diagonals, reduce_to_chunks
 from bodyslam_jax.solver.linearise import linearise
@@ -161,7 +162,8 @@ def _trailing(
     dtype = state.scale.dtype
     little = jnp.asarray(_ELIMINATION_DAMPING_EPS * jnp.finfo(dtype).eps, dtype)
     damping = damped(diagonals(lin, sizes), little)
-    chunks, window, _ = reduce_to_chunks(problem, lin, sizes, damping)
+    halves = half_inverses(lin.landmarks, damping["landmarks"])
+    chunks, window, _ = reduce_to_chunks(problem, lin, sizes, damping, halves)
     layout = dataclasses.replace(problem.layout, used=first)
     factor = factorise(chunks, sizes, layout)
     matrix = _unfactorised(chunks, factor, sizes, first, count)

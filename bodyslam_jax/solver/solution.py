@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.graph import State
@@ -60,8 +61,7 @@ class Solution(eqx.Module):
 
 def is_finite(state: State) -> Bool[Array, ""]:
     """Returns True if every array of the state is finite."""
-    leaves = [jnp.isfinite(x).all() for x in jax.tree.leaves(state)]
-    return jnp.stack(leaves).all()
+    return jnp.isfinite(ravel_pytree(state)[0]).all()
 
 
 def outcome(start, best, result, stats) -> tuple[Solution, Final]:

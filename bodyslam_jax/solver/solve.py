@@ -24,6 +24,7 @@ from bodyslam_jax.solver.levenberg_marquardt import (
 from bodyslam_jax.solver.lm_state import Final
 from bodyslam_jax.solver.padding import pad, unpad
 from bodyslam_jax.solver.schedule import Solver, Stage, check_names, check_schedule
+from bodyslam_jax.solver.shared_bodies import with_bodies, without_bodies
 from bodyslam_jax.solver.solution import Solution, only, outcome
 
 HISTORY_LENGTH_UNIT = 64
@@ -133,7 +134,7 @@ def run(
 
     `alone` is the value of `is_alone()` before anything was traced.
     """
-    given = problem, state, method
+    given = *without_bodies(problem), state, method
     if is_traced(given):
         return sequential_vmap(_program(False), _program(True))(*given)
     return _program(alone)(*given)
@@ -145,7 +146,8 @@ def _program(alone: bool) -> Callable[..., tuple[Solution, Final]]:
 
 
 @in_full_precision
-def _run(problem, state, method):
+def _run(problem, bodies, state, method):
+    problem = with_bodies(problem, bodies)
     found = optx.least_squares(
         lifted, method, state, problem, max_steps=None, throw=False
     )

@@ -16,11 +16,12 @@ from bodyslam_jax.solver.line_search import search
 from bodyslam_jax.solver.linear_system import (
     UNOBSERVED_DIAGONAL,
     Eliminated,
+    along,
     damped,
     diagonals,
     eliminate,
-    quadratic,
-    slope_along,
+    gradient_in_line,
+    in_line,
     solve_step,
 )
 
@@ -92,9 +93,12 @@ def attempt(
     )
     eliminated = eliminate(problem, lin, sizes, extra)
     move = solve_step(problem, state, lin, sizes, eliminated)
-    length = quadratic(problem, diagonal, sizes, move)
-    slope = -slope_along(problem, lin, sizes, move)
-    predicted = 0.5 * (quadratic(problem, extra, sizes, move) + slope)
+    # In one vector each, as every sum of a group would be a loop to be compiled.
+    moved = along(problem, sizes, move)
+    line = lambda known: in_line(known, moved.dtype, move.postures)
+    length = jnp.sum(line(diagonal) * moved**2)
+    slope = -jnp.sum(gradient_in_line(lin, sizes, move) * moved)
+    predicted = 0.5 * (jnp.sum(line(extra) * moved**2) + slope)
     finite = jnp.isfinite(predicted) & jnp.isfinite(length) & ~last
     move = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), move)
     slope = jnp.where(finite, slope, 0.0)

@@ -9,6 +9,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.solver.loops import row_of
@@ -51,20 +52,21 @@ def invert_lower(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     lower = lower + jnp.diag(jnp.arange(n + more) >= n).astype(lower.dtype)
 
     def blocks(shift, step):
-        """Returns every `step`-th block, `shift` below the diagonal, side by side."""
-        starts = range(0, n + more - shift * size, step * size)
-        pick = lambda k: lower[..., k + shift * size :, k:][..., :size, :size]
-        return jnp.stack([pick(k) for k in starts], axis=-3)
+        """Returns every `step`-th block, `shift` below the diagonal; blocks first."""
+        count = (n + more) // size
+        tiles = lower.reshape(*lower.shape[:-2], count, size, count, size)
+        column = np.arange(0, count - shift, step)
+        return tiles[..., column + shift, :, column, :]
 
     inverse = _substitute(blocks(0, 1))
-    while inverse.shape[-3] > 1:
-        first, last = inverse[..., 0::2, :, :], inverse[..., 1::2, :, :]
+    while len(inverse) > 1:
+        first, last = inverse[0::2], inverse[1::2]
         mixed = -last @ (blocks(1, 2) @ first)
         top = jnp.concatenate([first, jnp.zeros_like(mixed)], axis=-1)
         bottom = jnp.concatenate([mixed, last], axis=-1)
         inverse = jnp.concatenate([top, bottom], axis=-2)
         size *= 2
-    return inverse[..., 0, :n, :n]
+    return inverse[0, ..., :n, :n]
 
 
 def _substitute(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:

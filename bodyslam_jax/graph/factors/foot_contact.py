@@ -27,6 +27,7 @@ from bodyslam_jax.graph.factor import Frame, FrameFactor, Key
 from bodyslam_jax.graph.keypoint_jacobian import keypoint_jacobian
 from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.pelvis_displacement import previous_frame
+from bodyslam_jax.graph.state import State
 
 SLIP_RATIO = 0.03
 """κ: displacement of a point in contact as a share of the pelvis'."""
@@ -61,6 +62,16 @@ class FootContact(FrameFactor):
         p_C = p_H @ frame.root[:3, :3].T + (1 - SLIP_RATIO) * frame.root[:3, 3]
         eye = (1 - SLIP_RATIO) * scale * frame.camera[:3, 3]
         return p_C @ frame.camera[:3, :3].T + eye
+
+    def residual(self, state: State) -> Float[Array, "h t 4 3"]:
+        p_H = local_keypoints(self.body, state.poses, self.shape, "body25")
+        p_H = p_H[..., _TOES_AND_HEELS, :]
+        C_CH, r_CH = state.roots[..., :3, :3], state.roots[..., None, :3, 3]
+        p_C = p_H @ C_CH.swapaxes(-1, -2) + (1 - SLIP_RATIO) * r_CH
+        eye = (1 - SLIP_RATIO) * self.scale[..., None] * state.cameras[:, :3, 3]
+        C_CW = state.cameras[:, :3, :3].swapaxes(-1, -2)
+        q = p_C @ C_CW + eye[..., None, :]
+        return (q - previous_frame(q)) / self.sigma[..., None]
 
     def jacobians(self, state):
         of_frames = jax.vmap(self._with_derivatives)

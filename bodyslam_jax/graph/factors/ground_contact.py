@@ -50,6 +50,19 @@ class GroundContact(FrameFactor):
         (offset, sigma), (frame,) = data, window
         return (self._lowest(frame, shared, offset) - SOLE_HEIGHT_M)[None] / sigma
 
+    def residual(self, state: State) -> Float[Array, "h t 1"]:
+        # As `KeypointReprojection` does, so that both compute the body once.
+        p_H = local_keypoints(self.body, state.poses, state.shapes[:, None], "body25")
+        p_H = p_H[..., np.array(HEELS_AND_TOES), :]
+        C_CH, r_CH = state.roots[..., :3, :3], state.roots[..., :3, 3]
+        up_C = self.normal @ state.cameras[:, :3, :3]
+        up_H = jnp.einsum("tj,htjk->htk", up_C, C_CH)
+        height = jnp.einsum("htfk,htk->htf", p_H, up_H)
+        level = state.scale * (state.cameras[:, :3, 3] @ self.normal + self.offset)
+        height = height + (jnp.sum(r_CH * up_C, axis=-1) + level)[..., None]
+        lowest = _soft_minimum(height)
+        return ((lowest - SOLE_HEIGHT_M) / self.sigma)[..., None]
+
     def jacobian(self, data, window, shared):
         (offset, sigma), (frame,) = data, window
         p_H, by_pose, by_shape = keypoint_jacobian(
@@ -110,5 +123,5 @@ class GroundContact(FrameFactor):
         return p_C @ up_C + eye, up_C
 
 
-def _soft_minimum(height: Float[Array, " f"]) -> Float[Array, ""]:
-    return -_SOFTNESS_M * jax.nn.logsumexp(-height / _SOFTNESS_M)
+def _soft_minimum(height: Float[Array, "*b f"]) -> Float[Array, "*b"]:
+    return -_SOFTNESS_M * jax.nn.logsumexp(-height / _SOFTNESS_M, axis=-1)

@@ -23,8 +23,10 @@ from bodyslam_jax.graph.losses import Loss, Squared
 from bodyslam_jax.graph.pelvis_displacement import (
     displacement,
     displacements,
+    displacements_with_derivatives,
     previous_frame,
 )
+from bodyslam_jax.graph.state import State
 from bodyslam_jax.graph.whitening import innovation
 from bodyslam_jax.motion import leg_length
 
@@ -70,21 +72,29 @@ class HumanMotion(FrameFactor):
             error = innovation(error, earlier, correlation)
         return whitening @ error
 
+    def residual(self, state: State) -> Float[Array, "h t 3"]:
+        leg = unit_lengths(self.body, state)
+        return self._whitened(displacements(state) / leg[:, None, None])
+
+    def _whitened(self, d: Float[Array, "h t 3"]) -> Float[Array, "h t 3"]:
+        """Returns the residual of displacements in the unit of length."""
+        error, whitening = d - self.translation, self.whitening
+        if self.correlated:
+            rho = self.correlation[..., None]
+            error = innovation(error, previous_frame(error), rho)
+        return (whitening @ error[..., None])[..., 0]
+
     def jacobians(self, state):
-        d, parts = displacements(state)
+        d, parts = displacements_with_derivatives(state)
         jac = jnp.concatenate(list(parts.values()), axis=-1)
-        leg = jnp.ones_like(state.shapes[:, :1])
-        if self.body is not None:
-            one = jax.value_and_grad(lambda b: leg_length(self.body, b))
-            leg, by_shape = jax.vmap(one)(state.shapes)
-            leg = leg[:, None]
+        leg = unit_lengths(self.body, state)[:, None]
+        by_shape = unit_lengths_by_shape(self.body, state)
+        if by_shape is not None:
             by_shape = -d[..., None] * (by_shape / leg**2)[:, None, None]
             jac = jnp.concatenate([jac / leg[..., None, None], by_shape], axis=-1)
-        error = d / leg[..., None] - self.translation
         whitening, last = self.whitening, jnp.zeros_like(jac)
         if self.correlated:
             rho = self.correlation[..., None]
-            error = error - rho * previous_frame(error)
             whitening = whitening / jnp.sqrt(1 - rho**2)[..., None]
             last = -rho[..., None] * previous_frame(jac)
         now, last = whitening @ jac, whitening @ last
@@ -97,7 +107,23 @@ class HumanMotion(FrameFactor):
                 keys[name, 2] = six(last, 2 * i + 1)
         if self.body is not None:
             keys["shape", 0] = (now + last)[..., 25:]
-        return (whitening @ error[..., None])[..., 0], keys
+        return self._whitened(d / leg[..., None]), keys
+
+
+def unit_lengths(body: BodyModel | None, state: State) -> Float[Array, " h"]:
+    """Returns the leg length of each person, m; 1 m without a body."""
+    if body is None:
+        return jnp.ones_like(state.shapes[:, 0])
+    return leg_length(body, state.shapes)
+
+
+def unit_lengths_by_shape(
+    body: BodyModel | None, state: State
+) -> Float[Array, "h 10"] | None:
+    """Returns the derivative of `unit_lengths` by the shape, `None` without a body."""
+    if body is None:
+        return None
+    return jax.vmap(jax.jacfwd(lambda shape: leg_length(body, shape)))(state.shapes)
 
 
 def unit_length(body: BodyModel | None, shared: Shared) -> Float[Array, ""]:

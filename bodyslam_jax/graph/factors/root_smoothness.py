@@ -13,8 +13,18 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.graph.factor import FrameFactor, Key
-from bodyslam_jax.graph.factors.human_motion import unit_length
+from bodyslam_jax.graph.factors.human_motion import (
+    unit_length,
+    unit_lengths,
+    unit_lengths_by_shape,
+)
 from bodyslam_jax.graph.losses import Loss, Squared
+from bodyslam_jax.graph.pelvis_displacement import (
+    by_rotation_of,
+    pelvis_in_world,
+    previous_frame,
+)
+from bodyslam_jax.graph.state import State
 
 
 class RootSmoothness(FrameFactor):
@@ -43,3 +53,38 @@ class RootSmoothness(FrameFactor):
             for f in window
         )
         return (now - 2 * before + first) / unit_length(self.body, shared) / sigma
+
+    def residual(self, state: State) -> Float[Array, "h t 3"]:
+        leg = unit_lengths(self.body, state)
+        sigma = (leg[:, None] * self.sigma)[..., None]
+        return _bend(pelvis_in_world(state)) / sigma
+
+    def jacobians(self, state):
+        leg = unit_lengths(self.body, state)
+        sigma = (leg[:, None] * self.sigma)[..., None]
+        residual = _bend(pelvis_in_world(state)) / sigma
+        camera = jnp.broadcast_to(state.cameras, state.roots.shape)
+        C, r_WC = camera[..., :3, :3], camera[..., :3, 3]
+        by_rotation = by_rotation_of(C, state.roots[..., :3, 3])
+        eye = jnp.broadcast_to(jnp.eye(3, dtype=C.dtype), C.shape)
+        join = lambda *parts: jnp.concatenate(parts, axis=-1)
+        of_frame = {
+            "camera": join(by_rotation, state.scale * eye),
+            "root": join(jnp.zeros_like(C), C),
+        }
+        parts: dict[Key, Array] = {("scale", 0): (_bend(r_WC) / sigma)[..., None]}
+        for name, part in of_frame.items():
+            for lag, factor in enumerate((1.0, -2.0, 1.0)):
+                parts[name, lag] = factor * part / sigma[..., None]
+                part = previous_frame(part)
+        by_shape = unit_lengths_by_shape(self.body, state)
+        if by_shape is not None:
+            longer = (by_shape / leg[:, None])[:, None, None]
+            parts["shape", 0] = -residual[..., None] * longer
+        return residual, parts
+
+
+def _bend(x: Float[Array, "h t 3"]) -> Float[Array, "h t 3"]:
+    """Returns the second difference `x_k - 2 x_{k-1} + x_{k-2}`."""
+    before = previous_frame(x)
+    return x - 2 * before + previous_frame(before)

@@ -10,6 +10,7 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import Problem
@@ -32,9 +33,28 @@ class ReducedCameras(eqx.Module):
     lasting: Lasting | None
 
 
-def half_inverse(blocks: LandmarkBlocks, damping: Float[Array, "n 3 g"]) -> list[list]:
-    """Returns `L^-1` of each landmark's damped 3 x 3 block, as rows of arrays `n g`."""
-    v = lambda i, j: blocks.own[:, i, j] + (damping[:, i] if i == j else 0.0)
+Halves = list[list[Array]]
+"""`L^-1` of each landmark's damped 3 x 3 block `L L^T`, as rows of arrays `n g`."""
+
+
+def half_inverses(
+    tables: tuple[LandmarkBlocks, ...], damping: tuple[Array, ...]
+) -> tuple[Halves, ...]:
+    """Returns the factors of all tables, which are computed at once."""
+    if not tables:
+        return ()
+    own = jnp.concatenate([table.own for table in tables])
+    whole = half_inverse(own, jnp.concatenate(damping))
+    ends = np.cumsum([len(table.own) for table in tables])
+    parts = [slice(e - len(t.own), e) for e, t in zip(ends, tables, strict=True)]
+    return tuple([[x[part] for x in row] for row in whole] for part in parts)
+
+
+def half_inverse(
+    own: Float[Array, "n 3 3 g"], damping: Float[Array, "n 3 g"]
+) -> Halves:
+    """Returns the factor of each landmark's block `own`, damped."""
+    v = lambda i, j: own[:, i, j] + (damping[:, i] if i == j else 0.0)
     l00 = jnp.sqrt(v(0, 0))
     l10, l20 = v(1, 0) / l00, v(2, 0) / l00
     l11 = jnp.sqrt(v(1, 1) - l10**2)
@@ -50,6 +70,7 @@ def half_inverse(blocks: LandmarkBlocks, damping: Float[Array, "n 3 g"]) -> list
 def eliminate_landmarks(
     problem: Problem,
     tables: tuple[LandmarkBlocks, ...],
+    halves: tuple[Halves, ...],
     damping: tuple[Array, ...],
     sizes: Sizes,
 ) -> ReducedCameras:
@@ -60,12 +81,9 @@ def eliminate_landmarks(
     band = jnp.zeros((n, CAMERAS, sizes.bandwidth * CAMERAS), dtype)
     side = jnp.zeros((n, CAMERAS, count + 1), dtype)
     corner = jnp.zeros((count + 1, count + 1), dtype)
-    for bucket, table, damp in zip(
-        problem.layout.buckets, tables, damping, strict=True
-    ):
+    for bucket, table, half in zip(problem.layout.buckets, tables, halves, strict=True):
         if bucket.lasting:
             continue
-        half = half_inverse(table, damp)
         width = bucket.width
 
         slice_of = functools.partial(
@@ -116,16 +134,14 @@ def eliminate_landmarks(
 def substitute_landmarks(
     problem: Problem,
     tables: tuple[LandmarkBlocks, ...],
-    damping: tuple[Array, ...],
+    halves: tuple[Halves, ...],
     cameras: Float[Array, "t 6"],
     intrinsics: Float[Array, " i"],
     out: Float[Array, "l 3"],
 ) -> Float[Array, "l 3"]:
     """Returns `out` with the steps of all but lasting landmarks, given those of
     cameras, as their chunks stand, and of intrinsics."""
-    for bucket, table, damp in zip(
-        problem.layout.buckets, tables, damping, strict=True
-    ):
+    for bucket, table, half in zip(problem.layout.buckets, tables, halves, strict=True):
         if bucket.lasting:
             continue
         step = cameras[frames_of(bucket.first_chunk, bucket.width)]
@@ -134,7 +150,7 @@ def substitute_landmarks(
         taken = step.reshape(n, 1, -1) @ table.cross.reshape(n, -1, 3 * g)
         right = -table.gradient - taken.reshape(n, 3, g)
         right = right - jnp.einsum("nibg,i->nbg", table.cross_intrinsics, intrinsics)
-        moved = solve_landmarks(half_inverse(table, damp), right)
+        moved = solve_landmarks(half, right)
         out = out.at[bucket.landmark].set(jnp.moveaxis(moved, 1, 2), mode="drop")
     return out
 

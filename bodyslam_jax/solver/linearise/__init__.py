@@ -18,7 +18,7 @@ from bodyslam_jax.graph import (
     State,
 )
 from bodyslam_jax.solver.blocks import Linearisation, Observations, Sums, sizes_of
-from bodyslam_jax.solver.linearise.frame import linearise_frames
+from bodyslam_jax.solver.linearise.frame import Rows, add_products, rows_of
 from bodyslam_jax.solver.linearise.landmark import add_prior, linearise_landmarks
 from bodyslam_jax.solver.linearise.marginal_prior import linearise_marginal_prior
 
@@ -36,6 +36,7 @@ def linearise(
     """
     sums = Sums(sizes_of(problem, state, dtype), state)
     landmarks, priors, marginal = (), [], None
+    rows: list[Rows] = []
     for factor in problem.factors:
         if isinstance(factor, Reprojection):
             landmarks = linearise_landmarks(problem, factor, observations, state, sums)
@@ -45,14 +46,14 @@ def linearise(
         elif isinstance(factor, MarginalPrior):
             marginal = linearise_marginal_prior(problem, factor, state, sums)
         elif isinstance(factor, FrameFactor):
-            linearise_frames(problem, factor, state, sums)
+            rows += rows_of(problem, factor, state, sums)
+    add_products(sums, rows)
     for prior in priors:
         landmarks = add_prior(problem, prior, state, landmarks)
     return Linearisation(
         sums.blocks,
         sums.gradient,
-        sums.globals,
-        sums.globals_gradient,
+        *sums.globals(),
         landmarks,
         jnp.stack(sums.costs),
         marginal,

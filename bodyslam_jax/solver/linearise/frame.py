@@ -1,13 +1,15 @@
 """The blocks of factors over frames, from the variables that each factor touches.
 
 All derivatives of one frame, those by globals and the residual stand side by side; one
-Gram matrix a frame then holds every block and every gradient.
+Gram matrix a frame then holds every block and every gradient of a group of factors.
 """
 
 import dataclasses
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
@@ -18,6 +20,7 @@ from bodyslam_jax.graph import (
     State,
     squared_norm,
 )
+from bodyslam_jax.graph.factor import Key
 from bodyslam_jax.solver.blocks import Sums, shifted
 from bodyslam_jax.solver.posture import basis_of, to_coordinates
 
@@ -35,14 +38,33 @@ _FRAME_VARIABLES = ("pose", "root", "camera")
 _GLOBAL_VARIABLES = ("scale", "intrinsics", "globals", "shape")
 
 
-def linearise_frames(
+class Rows(NamedTuple):
+    """The weighted rows of one factor over frames; leading axes of all arrays `h t`, or
+    `1 t` for a factor of the camera alone."""
+
+    of_people: bool
+    columns: dict[Key, Array]
+    """Derivatives by the variables of each frame, and by those that frames share."""
+    residual: Array
+    precision: np.dtype
+    """Precision of the state, in which gradients are formed."""
+
+    @property
+    def local(self) -> list[Key]:
+        """Returns the variables of frames among the columns, in order."""
+        own = (key for key in self.columns if key[0] in _FRAME_VARIABLES)
+        return sorted(own, key=lambda key: _VARIABLE_ORDER[key[0]])
+
+
+def rows_of(
     problem: Problem, factor: FrameFactor, state: State, sums: Sums
-) -> None:
-    """Adds all blocks of one factor to `sums`; held coordinates have zeros."""
+) -> list[Rows]:
+    """Returns the rows of one factor, none if all its variables are held, and adds its
+    cost to `sums`; held coordinates have columns of zeros."""
     keys = [t for t in factor.touched if _GROUP_OF_VARIABLE[t[0]] in problem.variables]
     if not keys:
         sums.costs.append(factor.cost(state))
-        return
+        return []
     residual, parts = _derivatives(factor, keys, state, sums)
     s = squared_norm(residual)
     sums.costs.append(0.5 * jnp.sum(factor.loss.rho(s)))
@@ -54,32 +76,38 @@ def linearise_frames(
     lead = residual.shape[:2]
     rows = lambda x, *width: x.reshape(*lead, -1, *width)
     weight = rows(jnp.broadcast_to(root_weight, residual.shape), 1)
-    local = sorted(
-        (t for t in keys if t[0] in _FRAME_VARIABLES),
-        key=lambda t: _VARIABLE_ORDER[t[0]],
-    )
-    columns = []
-    for name, lag in local:
-        free = _free_of(problem, name, lag)
+    columns = {}
+    for name, lag in keys:
         part = parts[name, lag]
+        if name in _GLOBAL_VARIABLES:
+            free = _free_of_shared(problem, name, factor.of_people)
+            columns[name, lag] = rows(part, free.shape[-1]) * free * weight
+            continue
+        free = _free_of(problem, name, lag)
         if name != "pose":
-            columns.append(rows(part, 6) * free[..., None, :])
+            column = rows(part, 6) * free[..., None, :]
         elif factor.per_joint:
-            columns.append(_of_joints(problem, rows, part, free))
+            column = _of_joints(problem, rows, part, free)
         else:
-            part = rows(part, TURNS) * free[..., None, :]
-            columns.append(to_coordinates(problem, part))
-    common = [name for name in _GLOBAL_VARIABLES if (name, 0) in keys]
-    if common:
-        widths = _common_widths(sums.sizes)
-        for name in _GLOBAL_VARIABLES:
-            if name in common:
-                free = _free_of_shared(problem, name, factor.of_people)
-                columns.append(rows(parts[name, 0], widths[name]) * free)
-            else:
-                columns.append(jnp.zeros((*weight.shape[:-1], widths[name]), s.dtype))
-    columns.append(rows(residual, 1))
-    _add_products(sums, local, bool(common), columns, weight, factor)
+            column = rows(part, TURNS) * free[..., None, :]
+            column = to_coordinates(problem, column)
+        columns[name, lag] = column * weight
+    return [Rows(factor.of_people, columns, rows(residual, 1) * weight, s.dtype)]
+
+
+def add_products(sums: Sums, rows: list[Rows]) -> None:
+    """Adds the blocks of all factors to `sums`.
+
+    Factors that see no posture are stacked, as few rows each: one product of all takes
+    less time to compile than one of each, and no more to compute.
+    """
+    groups: dict[Any, list[Rows]] = {}
+    for i, part in enumerate(rows):
+        sees_posture = any(name == "pose" for name, _ in part.columns)
+        alike = part.of_people, part.residual.shape[:2]
+        groups.setdefault((i,) if sees_posture else alike, []).append(part)
+    for group in groups.values():
+        _add_products(sums, group)
 
 
 def _of_joints(problem, rows, part, free):
@@ -140,11 +168,34 @@ def _common_widths(sizes):
     return {"scale": 1, **named, "shape": 10}
 
 
-def _add_products(sums, local, has_common, columns, weight, factor):
-    of_people = factor.of_people
-    ends = [sum(c.shape[-1] for c in columns[: i + 1]) for i in range(len(columns))]
-    parts = [slice(e - c.shape[-1], e) for e, c in zip(ends, columns, strict=True)]
-    whole = jnp.concatenate(columns, axis=-1) * weight
+def _add_products(sums: Sums, group: list[Rows]) -> None:
+    first = group[0]
+    of_people = first.of_people
+    everything = Rows(
+        of_people,
+        {key: x for part in group for key, x in part.columns.items()},
+        first.residual,
+        first.precision,
+    )
+    local = everything.local
+    # Only what one factor couples has a block.
+    coupled = {(a, b) for part in group for a in part.columns for b in part.columns}
+    has_common = any(name in _GLOBAL_VARIABLES for name, _ in everything.columns)
+    common = [(name, 0) for name in _GLOBAL_VARIABLES] if has_common else []
+    width = {key: x.shape[-1] for key, x in everything.columns.items()}
+    width = {(name, 0): w for name, w in _common_widths(sums.sizes).items()} | width
+    keys = [*local, *common]
+    ends = [sum(width[k] for k in keys[: i + 1]) for i in range(len(keys))]
+    parts = {k: slice(e - width[k], e) for k, e in zip(keys, ends, strict=True)}
+
+    def stacked(part):
+        none = lambda key: jnp.zeros(
+            (*part.residual.shape[:-1], width[key]), part.residual.dtype
+        )
+        columns = [part.columns[k] if k in part.columns else none(k) for k in keys]
+        return jnp.concatenate([*columns, part.residual], axis=-1)
+
+    whole = jnp.concatenate([stacked(part) for part in group], axis=-2)
     jac = whole.astype(sums.sizes.dtype)
     gram = _products(jac, jac)
     if jac.dtype == whole.dtype:
@@ -153,23 +204,22 @@ def _add_products(sums, local, has_common, columns, weight, factor):
         slope = jnp.einsum("...ra,...r->...a", whole, whole[..., -1])
     # Blocks of row k that belong to a variable of frame k - lag are moved there.
     shift = lambda x, lag: shifted(x, -lag, 1)
-    spread = slice(ends[len(local) - 1] if local else 0, ends[-2] if has_common else 0)
+    spread = slice(sum(width[k] for k in local), ends[-1] if common else 0)
     squeeze = (lambda x: x) if of_people else (lambda x: x[0])
-    for i, (name, lag) in enumerate(local):
-        own = shift(slope[..., parts[i]], lag)
+    for name, lag in local:
+        here = parts[name, lag]
+        own = shift(slope[..., here], lag)
         sums.add_gradient(name if of_people else "camera_alone", squeeze(own))
-        for j, (other, other_lag) in enumerate(local):
-            here, there = (
-                (_VARIABLE_ORDER[name], lag),
-                (_VARIABLE_ORDER[other], other_lag),
-            )
-            if here > there:
+        for other, other_lag in local:
+            there = other, other_lag
+            before = (_VARIABLE_ORDER[name], lag) > (_VARIABLE_ORDER[other], other_lag)
+            if before or ((name, lag), there) not in coupled:
                 continue
-            block = shift(gram[..., parts[i], parts[j]], lag)
+            block = shift(gram[..., here, parts[there]], lag)
             key = (name, other) if of_people else ("alone", "alone")
             sums.add((*key, other_lag - lag), squeeze(block))
         if has_common:
-            block = shift(gram[..., parts[i], spread], lag)
+            block = shift(gram[..., here, spread], lag)
             sums.add((name if of_people else "alone", "globals", 0), squeeze(block))
     if has_common:
         n = sums.sizes.own_globals if of_people else sums.sizes.common

@@ -47,8 +47,7 @@ def linearise_marginal_prior(
         sums.add_gradient("pose", from_turns(problem, longer(down.poses, 1)))
     at = index.globals
     by_globals = jacobian[:, at]
-    sums.globals = sums.globals + by_globals.T @ by_globals
-    sums.globals_gradient = sums.globals_gradient + slope[at]
+    sums.add_all_globals(by_globals.T @ by_globals, slope[at])
     by_people = jacobian[:, index.roots]
     if "poses" in sizes.variables:
         postures = to_coordinates(problem, jacobian[:, index.postures])
