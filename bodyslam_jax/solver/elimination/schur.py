@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import Problem
-from bodyslam_jax.solver.blocks import CAMERAS, LandmarkBlocks, Sizes
+from bodyslam_jax.solver.blocks import CAMERAS, LandmarkBlocks, Sizes, cast
 from bodyslam_jax.solver.linearise.landmark import frames_of
 from bodyslam_jax.solver.long_tracks import Lasting, lasting_blocks
 from bodyslam_jax.solver.loops import scan_used
@@ -35,11 +35,13 @@ class ReducedCameras(eqx.Module):
 def half_inverse(blocks: LandmarkBlocks, damping: Float[Array, "n 3 g"]) -> list[list]:
     """Returns `L^-1` of each landmark's damped 3 x 3 block, as rows of arrays `n g`."""
     v = lambda i, j: blocks.own[:, i, j] + (damping[:, i] if i == j else 0.0)
-    l00 = jnp.sqrt(v(0, 0))
+    # No pivot is below its damping but by rounding.
+    root = lambda i, x: jnp.sqrt(jnp.maximum(x, damping[:, i]))
+    l00 = root(0, v(0, 0))
     l10, l20 = v(1, 0) / l00, v(2, 0) / l00
-    l11 = jnp.sqrt(v(1, 1) - l10**2)
+    l11 = root(1, v(1, 1) - l10**2)
     l21 = (v(2, 1) - l20 * l10) / l11
-    l22 = jnp.sqrt(v(2, 2) - l20**2 - l21**2)
+    l22 = root(2, v(2, 2) - l20**2 - l21**2)
     i00, i11, i22 = 1 / l00, 1 / l11, 1 / l22
     i10 = -l10 * i00 * i11
     i21 = -l21 * i11 * i22
@@ -65,7 +67,7 @@ def eliminate_landmarks(
     ):
         if bucket.lasting:
             continue
-        half = half_inverse(table, damp)
+        half = cast(half_inverse(table, damp), dtype)
         width = bucket.width
 
         slice_of = functools.partial(
@@ -98,7 +100,7 @@ def eliminate_landmarks(
             return (band, side, corner - e @ e.T), None
 
         extra = jnp.concatenate(
-            [table.cross_intrinsics, -table.gradient[:, None]], axis=1
+            [table.cross_intrinsics, -table.gradient[:, None].astype(dtype)], axis=1
         )
         groups = (bucket.first_chunk, table.cross, extra, half)
         start = band, side, corner
@@ -135,7 +137,8 @@ def substitute_landmarks(
         right = -table.gradient - taken.reshape(n, 3, g)
         right = right - jnp.einsum("nibg,i->nbg", table.cross_intrinsics, intrinsics)
         moved = solve_landmarks(half_inverse(table, damp), right)
-        out = out.at[bucket.landmark].set(jnp.moveaxis(moved, 1, 2), mode="drop")
+        moved = jnp.moveaxis(moved, 1, 2).astype(out.dtype)
+        out = out.at[bucket.landmark].set(moved, mode="drop")
     return out
 
 
