@@ -6,6 +6,7 @@
     python benchmarks/bench_solver.py joint --frames 1000 --mixed
     python benchmarks/bench_solver.py breakdown --frames 1000
     python benchmarks/bench_solver.py landmarks --frames 1000 --tracks long
+    python benchmarks/bench_solver.py landmarks --frames 300 --tracks deep --mixed
     python benchmarks/bench_solver.py peers --peers ceres jaxls --peer-python PYTHON
     python benchmarks/bench_solver.py baselines --frames 100 --baselines 1e-2x10 cg
     python benchmarks/bench_solver.py baselines --baselines jaxls --peer-python PYTHON
@@ -34,7 +35,7 @@ import solver_joint_peers
 import solver_peers
 from solver_calibration import calibration
 from solver_clock import timed
-from solver_scene import make
+from solver_scene import SECOND, make
 
 import bodyslam_jax.graph as g
 from bodyslam_jax.solver import Stage, marginalise, solve, vmap_over_devices
@@ -194,10 +195,10 @@ def main():
     )
     parser.add_argument(
         "--tracks",
-        choices=["short", "long", "again", "far", "corridor"],
+        choices=["short", "long", "again", "far", "corridor", *SECOND],
         default="short",
-        help="some last long, or go on on the way back, or a few all the time "
-        "(landmarks, joint, breakdown, peers)",
+        help="some last long, or go on on the way back, or a few all the time; or of "
+        "a second generator (landmarks, joint, breakdown, peers)",
     )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument(

@@ -27,6 +27,18 @@ SEEN = 150
 DRIFT = 0.012
 """Standard deviation of the change of the start's logarithm of scale, from frame to
 frame of the corridor."""
+SECOND = ("sixteen", "deep", "outliers", "sparse")
+"""Tracks of a second generator, which chose nothing in the solver: all of exactly
+`TRACK` frames; the same at depths of 1 to 200 m; the same with a quarter of outliers;
+or few landmarks seen long, and a start far away."""
+DEEP = 1.0, 200.0
+"""Depths of `deep`, m; their logarithms are uniform."""
+OUTLIERS = 0.25
+SPARSE = 2.3
+"""Landmarks of `sparse` for each frame; their tracks have 20 to 60 frames."""
+LOST = 0.1
+"""Standard deviation of the cameras of the start of `sparse`, rad and units of the
+map."""
 FAR = 40
 """Points so far away that the camera has them before it all the way."""
 
@@ -79,10 +91,13 @@ def make_tracks(frames, cameras, scale, rng, tracks, per_frame=9.6):
     each is as likely to be lost in the next frame as any other, and some last long;
     some points of `again` are seen a second time, on the way back; the last few of
     `far` are distant, and found in one frame of three all the time. Those of `corridor`
-    are on its walls, floor and ceiling, their lengths log-normal."""
+    are on its walls, floor and ceiling, their lengths log-normal. Those of `SECOND` are
+    described there."""
     if tracks == "corridor":
         # Of long tracks the first and last points are out of the image.
         per_frame = 1.15 * SEEN / (MEDIAN * np.exp(SPREAD**2 / 2))
+    if tracks == "sparse":
+        per_frame = SPARSE
     count = int(per_frame * frames)
     start = rng.integers(-int(TRACK) // 2, frames - 2, count)
     if tracks == "long":
@@ -90,6 +105,11 @@ def make_tracks(frames, cameras, scale, rng, tracks, per_frame=9.6):
     elif tracks == "corridor":
         length = rng.lognormal(np.log(MEDIAN), SPREAD, count)
         length = np.clip(length, 3, LONGEST).astype(int)
+    elif tracks == "sparse":
+        length = rng.integers(20, 61, count)
+    elif tracks in SECOND:
+        start = rng.integers(0, frames - int(TRACK), count)
+        length = np.full(count, int(TRACK))
     else:
         length = np.clip(rng.gamma(4.0, TRACK / 4, count), 4, 3 * TRACK).astype(int)
     stop = np.minimum(start + length, frames)
@@ -98,7 +118,10 @@ def make_tracks(frames, cameras, scale, rng, tracks, per_frame=9.6):
     start, stop = start[keep], stop[keep]
     middle = (start + stop) // 2
     u = rng.uniform([40, 40], [1240, 680], (len(start), 2))
-    depth = rng.uniform(3.0, 14.0, len(start)) / scale
+    if tracks == "deep":
+        depth = np.exp(rng.uniform(*np.log(DEEP), len(start))) / scale
+    else:
+        depth = rng.uniform(3.0, 14.0, len(start)) / scale
     ray = np.concatenate(
         [(u - INTRINSICS[2:]) / INTRINSICS[:2], np.ones((len(u), 1))], 1
     )
@@ -168,6 +191,8 @@ def make(
     # The scene is the same for every draw, so that one compilation serves all.
     rng = np.random.default_rng((seed, draw))
     pixel += noise * rng.standard_normal(pixel.shape)
+    if tracks == "outliers":
+        outliers = OUTLIERS
     wrong = rng.random(len(pixel)) < outliers
     pixel[wrong] += rng.uniform(-80, 80, (wrong.sum(), 2))
     frame, landmark, pixel = frame[seen], landmark[seen], pixel[seen]
@@ -183,7 +208,8 @@ def make(
     if people:
         factors += person(truth, missing, rng, array, loss, noise)
     problem = g.make_problem(factors, truth)
-    start = start_of(problem, truth, rng, array)
+    jitter = LOST if tracks == "sparse" else 2e-3
+    start = start_of(problem, truth, rng, array, jitter)
     if tracks == "corridor":
         start = with_scale_drift(start, frame, landmark, rng)
     return problem, truth, start
@@ -278,14 +304,15 @@ def drift(rng, shape, rho):
     return out
 
 
-def start_of(problem, truth, rng, array):
-    """What initialisation leaves: drifting cameras, points off, regressed bodies."""
+def start_of(problem, truth, rng, array, jitter):
+    """What initialisation leaves: cameras that drift and `jitter`, points off,
+    regressed bodies."""
     t = len(truth.cameras)
     wander = np.cumsum(rng.standard_normal((t, 6)), axis=0) * 3e-4
     zero = truth.zero_step()
     step = g.Step(
         scale=zero.scale,
-        cameras=array(wander + 2e-3 * rng.standard_normal((t, 6))),
+        cameras=array(wander + jitter * rng.standard_normal((t, 6))),
         roots=array(0.05 * rng.standard_normal(zero.roots.shape)),
         poses=zero.poses,
         shapes=array(0.5 * rng.standard_normal(zero.shapes.shape)),

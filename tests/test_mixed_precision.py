@@ -5,14 +5,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scenes
 from problems import dense, make
 
 from bodyslam_jax.solver import Stage, clock, solve, trace
+from bodyslam_jax.solver.blocks import LandmarkBlocks
 from bodyslam_jax.solver.compilation import quick_options
+from bodyslam_jax.solver.elimination.schur import half_inverse
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.padding import pad
-from bodyslam_jax.solver.solve import method_of, run
+from bodyslam_jax.solver.solve import is_mixed, method_of, run
+from bodyslam_jax.solver.step import Trial
 
 TIGHT = (Stage(rtol=1e-12, max_steps=60),)
 
@@ -143,3 +147,54 @@ def test_people_and_a_scale_ten_times_off(factor):
     found = mixed(problem, off)
     assert float(found.cost) == pytest.approx(float(best.cost), rel=1e-6)
     assert float(found.state.scale) == pytest.approx(float(best.state.scale), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_landmarks_own_blocks_are_those_of_double_precision():
+    problem, _, state = make(far=2)
+    problem, state = pad(problem, state)
+    whole = eqx.filter_jit(linearise, compiler_options=quick_options())
+    double = whole(problem, gather(problem), state)
+    single = whole(problem, gather(problem), state, np.dtype(np.float32))
+    for expected, found in zip(double.landmarks, single.landmarks, strict=True):
+        assert found.cross.dtype == np.float32
+        scale = abs(expected.own).max()
+        np.testing.assert_allclose(found.own, expected.own, atol=1e-13 * scale)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_no_pivot_of_a_landmark_is_below_its_damping(dtype):
+    # Without depth, and with a last pivot that rounding makes negative.
+    own = np.array([[1.0, 1, 1], [1, 1, 1], [1, 1, 1 - 1e-6]], dtype)
+    damping = np.full((1, 3, 1), 1e-9, dtype)
+    blocks = LandmarkBlocks(
+        cross=jnp.zeros((1, 0, 6, 3, 1), dtype),
+        cross_intrinsics=jnp.zeros((1, 0, 3, 1), dtype),
+        own=jnp.asarray(own)[None, :, :, None],
+        gradient=jnp.zeros((1, 3, 1), dtype),
+    )
+    rows = half_inverse(blocks, jnp.asarray(damping))
+    for row in rows:
+        assert all(bool(jnp.isfinite(x).all()) for x in row)
+        assert float(row[-1].max()) <= 1e-9**-0.5 * (1 + 1e-6)
+
+
+def test_the_least_damping_rises_where_a_factorisation_failed():
+    trial = Trial(*[None] * len(Trial._fields))._replace(
+        damping=jnp.asarray(1e-8), finite=jnp.array(False)
+    )
+    least = jnp.asarray(1e-8)
+    assert float(trial.next_least(least)) == pytest.approx(1e-7)
+    assert float(trial.next_least(jnp.asarray(1e-6))) == pytest.approx(1e-6)
+    far = trial._replace(damping=jnp.asarray(1e-2))
+    assert float(far.next_least(least)) == pytest.approx(1e-6)
+    assert float(trial._replace(finite=jnp.array(True)).next_least(least)) == least
+
+
+def test_the_default_is_single_precision_for_long_problems_without_people():
+    zero = lambda people, frames: scenes.truth(np.random.default_rng(0), frames, people)
+    assert is_mixed(None, zero(0, 100))
+    assert not is_mixed(None, zero(0, 99))
+    assert not is_mixed(None, zero(1, 100))
+    assert not is_mixed(False, zero(0, 100))
+    assert is_mixed(True, zero(1, 7))

@@ -47,7 +47,9 @@ def adjust(
     free = guess is not None and config.structure.focal_sigma > HELD_FOCAL_SIGMA
     factors = _factors(cameras, sigma, config, free)
     problem = _problem(factors, state, config.structure, guess)
-    solution = solver.solve(problem, state)
+    # Covariances are of factors in double precision: one program is enough.
+    mixed = None if guess is None else False
+    solution = solver.solve(problem, state, mixed_precision=mixed)
     before = float(solution.first_cost)
     log.info("bundle adjustment: cost %.4g -> %.4g", before, float(solution.cost))
     state = solution.state

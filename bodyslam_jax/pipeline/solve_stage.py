@@ -27,7 +27,14 @@ def solve_stage(
     start = time.perf_counter()
     schedule = schedule_of(config)
     schedule = schedule if name == "joint" else schedule[-1:]
-    solution = solver.solve(problem, state, solver=config.solver, schedule=schedule)
+    # Covariances that follow are of factors in double precision: one program is enough.
+    solution = solver.solve(
+        problem,
+        state,
+        solver=config.solver,
+        schedule=schedule,
+        mixed_precision=False,
+    )
     before, after = float(solution.first_cost), float(solution.cost)
     steps = sum(int(n) for n in solution.num_steps)
     status = solution.status

@@ -35,7 +35,8 @@ class Sizes(eqx.Module):
     posture: int = eqx.field(static=True)
     """Number of coordinates of a posture (`posture.py`)."""
     dtype: np.dtype = eqx.field(static=True)
-    """Precision of blocks and factors: the state's, or a lower one (see `solve`)."""
+    """Precision of blocks and factors: the state's, or a lower one (see `solve`);
+    landmarks' own blocks have the state's."""
 
     @property
     def common(self) -> int:
@@ -65,6 +66,7 @@ class LandmarkBlocks(eqx.Module):
     """Camera against landmark."""
     cross_intrinsics: Float[Array, "n i 3 g"]
     own: Float[Array, "n 3 3 g"]
+    """Landmark against itself, always in the precision of the state."""
     gradient: Float[Array, "n 3 g"]
 
 

@@ -20,6 +20,7 @@ from bodyslam_jax.solver.schedule import Stage, check_schedule
 from bodyslam_jax.solver.solution import Solution, only, outcome
 from bodyslam_jax.solver.solve import (
     check_start,
+    is_mixed,
     method_of,
     restrict,
     restrict_to_all,
@@ -33,7 +34,7 @@ def trace(
     *,
     schedule: tuple[Stage, ...] = (Stage(),),
     damping: float = 1e-4,
-    mixed_precision: bool = False,
+    mixed_precision: bool | None = None,
 ) -> tuple[State, Any]:
     """Runs each stage for all of its `max_steps` and notes `observe(state)` each time.
 
@@ -44,7 +45,7 @@ def trace(
     **Raises:** `ValueError` as `solve`.
     """
     _check(problem, state, schedule, damping)
-    settings = observe, schedule, damping, mixed_precision
+    settings = observe, schedule, damping, is_mixed(mixed_precision, state)
     watched = lambda problem, state: _trace(problem, state, *settings)
     return (sequential_vmap(watched) if is_traced(state) else watched)(problem, state)
 
@@ -97,7 +98,7 @@ def clock(
     *,
     schedule: tuple[Stage, ...] = (Stage(),),
     damping: float = 1e-4,
-    mixed_precision: bool = False,
+    mixed_precision: bool | None = None,
 ) -> tuple[Solution, tuple[np.ndarray, ...]]:
     """Solves as `solve` does, and returns the wall time of each iteration, s, by stage.
 
@@ -114,7 +115,7 @@ def clock(
     problem, start = pad(problem, state)
     problem = restrict_to_all(problem, schedule)
     dtype = state.scale.dtype
-    method = method_of(schedule, damping, dtype, mixed=mixed_precision)
+    method = method_of(schedule, damping, dtype, mixed=is_mixed(mixed_precision, state))
     loop = _begin(method, problem, start)
     arrays, static = eqx.partition(loop, eqx.is_array)
     program = (

@@ -35,7 +35,7 @@ from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.lm_state import Final, History, Loop
 from bodyslam_jax.solver.retriangulation import triangulate_anew
 from bodyslam_jax.solver.second_order import add_second_order, curvature_if, next_share
-from bodyslam_jax.solver.step import Trial, attempt
+from bodyslam_jax.solver.step import Trial, attempt, least_damping
 
 MAX_DAMPING = 1e12
 """Damping above which a stage ends without convergence."""
@@ -71,7 +71,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     length: int = eqx.field(static=True)
     """Number of rows of the history."""
     dtype: np.dtype = eqx.field(static=True)
-    """Precision of blocks and factors."""
+    """Precision of blocks and factors (`blocks.Linearisation`)."""
     norm: Callable[..., Any] = optx.max_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
@@ -89,6 +89,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             final=empty[0],
             stale=jnp.array(True),
             damping=jnp.asarray(self.damping, dtype),
+            least_damping=jnp.asarray(least_damping(dtype), dtype),
             landmark_damping=jnp.zeros(len(y.landmarks), dtype),
             searched=jnp.array(0),
             nu=jnp.asarray(2.0, dtype),
@@ -160,7 +161,8 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         cost = jnp.sum(terms)
         found = before - cost > enough
         done = done & ~found
-        damping = trial.next_damping(state.nu)
+        least_possible = trial.next_least(state.least_damping)
+        damping = trial.next_damping(state.nu, least_possible)
         stuck = ~accept & ~done & ~found & (damping > MAX_DAMPING)
         broken = ~jnp.isfinite(known)
         row = jnp.where(last, len(self.limit), at)
@@ -202,6 +204,9 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             final=final_of(lin, trial.eliminated),
             stale=accept | found | over | last,
             damping=jnp.where(over, self.damping, damping).astype(dtype),
+            least_damping=jnp.where(over, least_damping(dtype), least_possible).astype(
+                dtype
+            ),
             landmark_damping=trial.landmark_damping,
             searched=jnp.where(over, 0, jnp.where(look, nth + 1, nth)),
             nu=jnp.where(accept | over, 2.0, 2 * state.nu).astype(dtype),

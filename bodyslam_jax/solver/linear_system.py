@@ -6,6 +6,7 @@ and back. A coordinate that no measurement sees has a zero row, gets 1 on its di
 and stays where it is.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -104,8 +105,9 @@ def eliminate(
     problem: Problem, lin: Linearisation, sizes: Sizes, damping: dict
 ) -> Eliminated:
     """Factorises the damped normal equations, in the precision of `sizes`."""
-    lin, damping = cast((lin, damping), sizes.dtype)
-    halves = half_inverses(lin.landmarks, damping["landmarks"])
+    lin, of_landmarks = _low(lin, sizes), damping["landmarks"]
+    damping = {**cast(damping, sizes.dtype), "landmarks": of_landmarks}
+    halves = half_inverses(lin.landmarks, of_landmarks)
     chunks, window, people = reduce_to_chunks(problem, lin, sizes, damping, halves)
     factor = factorise(chunks, sizes, problem.layout)
     return Eliminated(halves, window, people, factor)
@@ -138,6 +140,21 @@ def reduce_to_chunks(
     return chunks, window, people
 
 
+def _low(lin: Linearisation, sizes: Sizes) -> Linearisation:
+    """Returns the blocks in the precision of `sizes`; landmarks' own 3 x 3 blocks and
+    gradients stay as they are.
+
+    What many frames see under a small angle bends so little along its depth that
+    rounding in single precision hides it: a damping that hides the rounding would then
+    hold back all others.
+    """
+    tables = tuple(
+        dataclasses.replace(cast(t, sizes.dtype), own=t.own, gradient=t.gradient)
+        for t in lin.landmarks
+    )
+    return dataclasses.replace(cast(lin, sizes.dtype), landmarks=tables)
+
+
 class Move(NamedTuple):
     """A step, and the coordinates of its postures (`posture.py`)."""
 
@@ -155,7 +172,7 @@ def solve_step(
 ) -> Move:
     """Solves the factorised equations for a step, in the state's own precision."""
     h, n = sizes.people, sizes.chunks
-    lin, zero = cast((lin, state.zero_step()), sizes.dtype)
+    lin, zero = _low(lin, sizes), cast(state.zero_step(), sizes.dtype)
     steps, common = back_substitute(eliminated.factor, sizes)
     head = steps.shape[1] - CAMERAS
     of_cameras = lambda x: x[:, head:].reshape(n * CAMERAS // 6, 6)

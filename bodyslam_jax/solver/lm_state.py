@@ -49,6 +49,8 @@ class Loop(eqx.Module):
     stale: Bool[Array, ""]
     """Whether `final.lin` belongs to an earlier state or stage."""
     damping: Float[Array, ""]
+    least_damping: Float[Array, ""]
+    """Least damping in this stage, above those at which factorisations failed."""
     landmark_damping: Float[Array, " l"]
     """Least damping of each landmark, as a share of its own diagonal."""
     searched: Int[Array, ""]

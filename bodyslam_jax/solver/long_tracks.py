@@ -47,13 +47,13 @@ def lasting_blocks(
         chunk = bucket.first_chunk[i]
         at = (chunk, jnp.zeros_like(chunk), jnp.full_like(chunk, 3 * i * g))
         cameras = jax.lax.dynamic_update_slice(cameras, cross[i], at)
-    own = table.own + damp[:, :, None] * jnp.eye(3, dtype=sizes.dtype)[..., None]
+    own = table.own + damp[:, :, None] * jnp.eye(3, dtype=damp.dtype)[..., None]
     groups, landmarks = jnp.eye(n, dtype=own.dtype), jnp.eye(g, dtype=own.dtype)
     own = jnp.einsum("nabg,nm,gh->nagmbh", own, groups, landmarks)
     return Lasting(
         cameras=cameras,
         intrinsics=jnp.moveaxis(table.cross_intrinsics, 1, 0).reshape(-1, 3 * n * g),
-        own=own.reshape(3 * n * g, -1),
+        own=own.reshape(3 * n * g, -1).astype(sizes.dtype),
         rhs=-table.gradient.reshape(-1).astype(sizes.dtype),
     )
 

@@ -29,6 +29,9 @@ from bodyslam_jax.solver.solution import Solution, only, outcome
 
 HISTORY_LENGTH_UNIT = 64
 """Number of rows of a history is a multiple of this: schedules share a compilation."""
+MIN_MIXED_FRAMES = 100
+"""Number of frames from which on the steps of a problem without people are found in
+single precision by default: below, they take milliseconds."""
 
 
 def solve(
@@ -38,7 +41,7 @@ def solve(
     solver: Solver = "structured",
     schedule: tuple[Stage, ...] = (Stage(),),
     damping: float = 1e-4,
-    mixed_precision: bool = False,
+    mixed_precision: bool | None = None,
 ) -> Solution:
     """Minimises the cost of a problem from a first state.
 
@@ -52,9 +55,10 @@ def solve(
       the second-order term Σ rᵢ ∇²rᵢ of the keypoint factors (`second_order.py`). 0 is
       Gauss-Newton: full steps of `J^T J`, as long as they lower the cost. Baselines
       have dampings of their own.
-    - `mixed_precision`: `structured` solves for its steps in single precision, in two
-      thirds of the time for long videos; residuals, gradients and costs, and so the
-      minimum, keep the precision of `state`. Flat directions are damped a little more.
+    - `mixed_precision`: `structured` solves for its steps in single precision, which
+      takes two thirds to four fifths of the time; residuals, gradients, costs and
+      landmarks' own blocks, and so the minimum, keep the precision of `state`. By
+      default problems without people of `MIN_MIXED_FRAMES` or more.
 
     Pure: jits, differentiates, and maps over problems or states of one shape: one after
     another on a CPU, which is no slower there, at once elsewhere; `vmap_over_devices`
@@ -79,10 +83,18 @@ def solve(
         baselines.check_size(solver, problem, state)
         return _solve_baseline(problem, state, solver, schedule)
     padded, start = pad(problem, jax.lax.stop_gradient(state))
-    given = padded, start, schedule, damping, mixed_precision
+    given = padded, start, schedule, damping, is_mixed(mixed_precision, state)
     solution = _differentiable(*given, is_alone())
     sizes = len(state.cameras), len(state.landmarks)
     return eqx.tree_at(lambda s: s.state, solution, unpad(solution.state, *sizes))
+
+
+def is_mixed(mixed_precision: bool | None, state: State) -> bool:
+    """Returns whether steps are found in single precision: as asked for, else without
+    people from `MIN_MIXED_FRAMES` on."""
+    if mixed_precision is not None:
+        return mixed_precision
+    return not len(state.roots) and len(state.cameras) >= MIN_MIXED_FRAMES
 
 
 def check_start(problem: Problem, state: State, damping: float = 0.0) -> None:

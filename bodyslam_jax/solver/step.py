@@ -33,6 +33,14 @@ MIN_DAMPING_FACTOR = 0.1
 """Least factor by which a good step lowers the damping (Nielsen)."""
 
 
+FAILED_DAMPING_FACTOR = 10.0
+"""Ratio of the least damping to one at which a factorisation failed: one step of
+`MIN_DAMPING_FACTOR`, so that damping does not come back to it."""
+MAX_LEAST_DAMPING = 1e-6
+"""Greatest least damping. Equations that fail above it do so for another reason than
+rounding, which is 6e-8 in single precision."""
+
+
 class Trial(NamedTuple):
     """A trial step, with its true robust cost and whether it is accepted."""
 
@@ -54,9 +62,16 @@ class Trial(NamedTuple):
     landmark_damping: Float[Array, " l"]
     """Damping of individual landmarks for the next step."""
 
-    def next_damping(self, nu: Float[Array, ""]) -> Float[Array, ""]:
+    def next_least(self, least: Float[Array, ""]) -> Float[Array, ""]:
+        """Returns the least damping of later steps: higher where rounding left the
+        equations without a factorisation, so that they do not fail again."""
+        failed = jnp.minimum(FAILED_DAMPING_FACTOR * self.damping, MAX_LEAST_DAMPING)
+        return jnp.where(self.finite, least, jnp.maximum(least, failed))
+
+    def next_damping(
+        self, nu: Float[Array, ""], least: Float[Array, ""]
+    ) -> Float[Array, ""]:
         """Returns the next damping: by Nielsen's factor, or `nu` times if rejected."""
-        least = least_damping(self.eliminated.factor.half.dtype)
         shrink = jnp.maximum(1 - (2 * self.gain - 1) ** 3, MIN_DAMPING_FACTOR)
         shrink = jnp.where(self.gain < 0.25, 2.0, shrink)
         lower = jnp.maximum(self.damping * shrink, least)
@@ -126,13 +141,15 @@ def attempt(
 
 
 def least_damping(dtype) -> float:
-    """Returns the least damping of a step, which depends on the precision.
+    """Returns the least damping of a step, by the precision of the state.
 
     In double precision it is far below the stiffness of the softest bending mode of a
     long path of cameras, which falls with the fourth power of its length: 1e-10 of a
-    camera's own at 1,000 frames. In single precision it is the least that rounding
-    leaves positive definite: with a tenth of it every third factorisation fails, and
-    there are no fewer steps.
+    camera's own at 1,000 frames. Factors in single precision follow nearly as far, as
+    landmarks' own blocks have the precision of the state; where one fails,
+    `Trial.next_least` raises the least damping. With a state in single precision it is
+    the least that rounding leaves positive definite: with a tenth of it every third
+    factorisation fails, and there are no fewer steps.
     """
     return 1e-12 if dtype == jnp.float64 else 3e-7
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import Problem
-from bodyslam_jax.solver.blocks import CAMERAS, LandmarkBlocks, Sizes
+from bodyslam_jax.solver.blocks import CAMERAS, LandmarkBlocks, Sizes, cast
 from bodyslam_jax.solver.linearise.landmark import frames_of
 from bodyslam_jax.solver.long_tracks import Lasting, lasting_blocks
 from bodyslam_jax.solver.loops import scan_used
@@ -55,11 +55,13 @@ def half_inverse(
 ) -> Halves:
     """Returns the factor of each landmark's block `own`, damped."""
     v = lambda i, j: own[:, i, j] + (damping[:, i] if i == j else 0.0)
-    l00 = jnp.sqrt(v(0, 0))
+    # No pivot is below its damping but by rounding.
+    root = lambda i, x: jnp.sqrt(jnp.maximum(x, damping[:, i]))
+    l00 = root(0, v(0, 0))
     l10, l20 = v(1, 0) / l00, v(2, 0) / l00
-    l11 = jnp.sqrt(v(1, 1) - l10**2)
+    l11 = root(1, v(1, 1) - l10**2)
     l21 = (v(2, 1) - l20 * l10) / l11
-    l22 = jnp.sqrt(v(2, 2) - l20**2 - l21**2)
+    l22 = root(2, v(2, 2) - l20**2 - l21**2)
     i00, i11, i22 = 1 / l00, 1 / l11, 1 / l22
     i10 = -l10 * i00 * i11
     i21 = -l21 * i11 * i22
@@ -84,6 +86,7 @@ def eliminate_landmarks(
     for bucket, table, half in zip(problem.layout.buckets, tables, halves, strict=True):
         if bucket.lasting:
             continue
+        half = cast(half, dtype)
         width = bucket.width
 
         slice_of = functools.partial(
@@ -116,7 +119,7 @@ def eliminate_landmarks(
             return (band, side, corner - e @ e.T), None
 
         extra = jnp.concatenate(
-            [table.cross_intrinsics, -table.gradient[:, None]], axis=1
+            [table.cross_intrinsics, -table.gradient[:, None].astype(dtype)], axis=1
         )
         groups = (bucket.first_chunk, table.cross, extra, half)
         start = band, side, corner
@@ -151,7 +154,8 @@ def substitute_landmarks(
         right = -table.gradient - taken.reshape(n, 3, g)
         right = right - jnp.einsum("nibg,i->nbg", table.cross_intrinsics, intrinsics)
         moved = solve_landmarks(half, right)
-        out = out.at[bucket.landmark].set(jnp.moveaxis(moved, 1, 2), mode="drop")
+        moved = jnp.moveaxis(moved, 1, 2).astype(out.dtype)
+        out = out.at[bucket.landmark].set(moved, mode="drop")
     return out
 
 

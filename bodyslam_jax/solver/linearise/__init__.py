@@ -32,7 +32,8 @@ def linearise(
 ) -> Linearisation:
     """Returns all blocks at a state; held coordinates have zero rows and columns.
 
-    Blocks are kept in `dtype`, gradients and costs in the state's own.
+    Blocks are kept in `dtype`; landmarks' own blocks, gradients and costs in the
+    state's.
     """
     sums = Sums(sizes_of(problem, state, dtype), state)
     landmarks, priors, marginal = (), [], None

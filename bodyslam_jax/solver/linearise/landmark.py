@@ -16,6 +16,7 @@ from bodyslam_jax.solver.linearise.projection import (
     Pixels,
     cross,
     dot,
+    pair,
     see,
     symmetric,
     times,
@@ -92,7 +93,11 @@ def linearise_landmarks(
     side = [jnp.stack(x, 2) for x in turned] + [-jnp.stack(x, 2) for x in moved]
     table = jnp.stack(side, 2) * free_c[..., None, None] * free_l[:, None, None]
     down = lambda vector: jnp.stack([jnp.sum(x, axis=1) for x in vector], 1)
-    own = jnp.stack([down(x) for x in moved], 1) * free_l[:, None] * free_l[:, :, None]
+    own = moved
+    if dtype != free.dtype:
+        by_point = [pair(x) for x in pixels.by_point]
+        own = symmetric(lambda i, j: dot(by_point[i], by_point[j]))
+    own = jnp.stack([down(x) for x in own], 1) * free[:, None] * free[:, :, None]
     common = [down(times(C, x)) * free_l for x in pixels.by_intrinsics]
     slope = down(times(pixels.C, pixels.slope)) * free
     tables, start = [], 0

@@ -35,6 +35,8 @@ class Pixels(NamedTuple):
     """p_C"""
     square: Square
     """`P^T P`"""
+    by_point: list[Float[Array, "u b 2 g"]]
+    """Derivative by the point in the world, by coordinates."""
     slope: Vector
     """`P^T e`"""
     by_intrinsics: list[Vector]
@@ -73,22 +75,23 @@ def see(
     if sizes.intrinsics:
         by_i = jax.jacfwd(lambda i: pixels(i, p_C))(state.intrinsics)
         Q = jnp.moveaxis(by_i * problem.free.intrinsics, -1, 0) * weight
-    low_P = [_pair(x.astype(sizes.dtype)) for x in P]
+    low_P = [pair(x.astype(sizes.dtype)) for x in P]
     return Pixels(
         C=[[C[:, :, i, j] for i in range(3)] for j in range(3)],
         point=[p_C[:, :, i] for i in range(3)],
         square=symmetric(lambda i, j: dot(low_P[i], low_P[j])),
-        slope=[dot(_pair(x), _pair(error)) for x in P],
-        by_intrinsics=[
-            [dot(x, _pair(q.astype(sizes.dtype))) for x in low_P] for q in Q
+        by_point=[
+            add(P[i] * C[:, :, j, i, :, None] for i in range(3)) for j in range(3)
         ],
+        slope=[dot(pair(x), pair(error)) for x in P],
+        by_intrinsics=[[dot(x, pair(q.astype(sizes.dtype))) for x in low_P] for q in Q],
         intrinsics=jnp.einsum("iubcg,jubcg->ij", Q, Q),
         intrinsics_slope=jnp.einsum("iubcg,ubcg->i", Q, error),
         cost=0.5 * jnp.sum(factor.loss.rho(s)),
     )
 
 
-def _pair(x: Float[Array, "u b 2 g"]) -> Vector:
+def pair(x: Float[Array, "u b 2 g"]) -> Vector:
     return [x[:, :, 0], x[:, :, 1]]
 
 
