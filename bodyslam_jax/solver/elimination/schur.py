@@ -151,8 +151,9 @@ def substitute_landmarks(
         n, g = len(step), table.own.shape[-1]
         # A product in the order of the tables, which `einsum` would transpose first.
         taken = step.reshape(n, 1, -1) @ table.cross.reshape(n, -1, 3 * g)
-        right = -table.gradient - taken.reshape(n, 3, g)
-        right = right - jnp.einsum("nibg,i->nbg", table.cross_intrinsics, intrinsics)
+        taken = taken.reshape(n, 3, g)
+        taken += jnp.einsum("nibg,i->nbg", table.cross_intrinsics, intrinsics)
+        right = -table.gradient - taken.astype(table.gradient.dtype)
         moved = solve_landmarks(half, right)
         moved = jnp.moveaxis(moved, 1, 2).astype(out.dtype)
         out = out.at[bucket.landmark].set(moved, mode="drop")
