@@ -2,19 +2,26 @@
 
 Most of the suite's time is compiling, so XLA optimises little (`optimised` undoes that
 for a test file). The tests of a file run in one process (`--dist loadfile`) and share
-what is traced; processes share machine code through JAX's persistent cache. Compiled
-programs are dropped at the end of each file, and where a process exceeds `_MEMORY`.
+what is traced; processes share machine code through JAX's persistent cache, also of the
+thousands of small programs of single operations, which take half as long to find there
+as to compile. Compiled programs are dropped at the end of each file, and where a
+process exceeds `_MEMORY`.
 """
 
 import gc
 import os
 import sys
+import threading
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import jaxlib.version
+import numpy as np
 import pytest
+from jax._src.interpreters import mlir
+from jax._src.lax.lax import stage_p
+from jaxlib.mlir import ir
 
 if jaxlib.version.__version__.startswith("0.10."):
     # As the package compiles its own large programs: compiling is what most tests wait
@@ -27,19 +34,70 @@ _MEMORY = 1.3e9
 """Resident memory of a process, bytes, from which compiled programs are dropped after
 a test: two processes stay below 4 GB."""
 
+_LONGEST = (
+    *("solver", "toolkit", "marginalisation", "experiments", "frontend_lens", "docs"),
+    *("posture_basis", "motion_training", "safe_pickle", "compilation", "online"),
+    *("stack_cases", "evaluation", "globals", "given_facts", "interruption"),
+    *("mixed_precision", "people_noise", "people_floor", "experiments_video"),
+    *("pipeline", "graph", "frontend_motion", "fuzz"),
+)
+"""Files that take a minute or more, the longest first."""
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_disable_most_optimizations", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
     folder = Path(__file__).parents[1] / ".pytest_cache" / "jax"
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+# As in the command: Python's 700 new objects cost a seventh of tracing time.
+gc.set_threshold(50_000)
+_new_context = mlir.make_ir_context
+_shared = threading.local()
+
+
+def _context():
+    """One MLIR context for all programs of a thread, which take a third less time to
+    lower so if they are small; within the lowering of another program a new one."""
+    if ir.Context.current is not None:
+        return _new_context()
+    if not hasattr(_shared, "context"):
+        _shared.context = _new_context()
+    return _shared.context
+
+
+mlir.make_ir_context = _context
+_stage = stage_p.impl
+
+
+def _put(x):
+    """As `jnp.asarray` of a NumPy array, which compiles a program for each shape: a
+    third of all programs of the tests."""
+    return jax.device_put(x.copy()) if isinstance(x, np.ndarray) else _stage(x)
+
+
+stage_p.def_impl(_put)
+
+
+@pytest.fixture
+def compiles_as_usual():
+    """`jnp.asarray` compiles as for users, for a test of what is compiled."""
+    stage_p.def_impl(_stage)
+    yield
+    stage_p.def_impl(_put)
+
+
+def pytest_collection_modifyitems(items):
+    """Long files begin first: the last one would leave a process idle."""
+    order = {f"test_{name}.py": k for k, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
 
 
 def drop_programs() -> None:
     """Frees compiled programs and what was traced for them."""
     eqx.clear_caches()
     jax.clear_caches()
+    vars(_shared).clear()
     gc.collect()
 
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scenes
+import scipy.sparse.linalg
 from jax.flatten_util import ravel_pytree
 from own_factors import CameraSmoothness
 
@@ -45,17 +46,15 @@ def make(
     loss = jnp.asarray(1.5)
     factors = [scenes.reprojection(rng, state, 0.5 * noise, length, loss, again, far)]
     if people:
-        # In one program: one by one its operations take five times as long to compile.
-        scenes.body_model()
-        measure = lambda state: scenes.person_factors(rng, state, noise=noise)
-        factors += eqx.filter_jit(measure, compiler_options=quick_options())(state)
+        factors += scenes.person_factors(rng, state, noise=noise)
     if known:
         factors.insert(0, scenes.landmark_prior(rng, state, factors[0]))
     if steady:
         sigma = jnp.full((frames, 2), 0.05).at[:2].set(jnp.inf)
         factors.append(CameraSmoothness(sigma=sigma))
     if extras:
-        factors += scenes.extra_factors(rng, state, factors[0])
+        more = lambda state: scenes.extra_factors(rng, state, factors[0])
+        factors += eqx.filter_jit(more, compiler_options=quick_options())(state)
     problem = g.make_problem(factors, state, **options)
     if some_held:
         problem = eqx.tree_at(lambda p: p.free, problem, hold_some(problem.free))
@@ -90,6 +89,29 @@ def _dense_of(problem, state):
 
 
 _dense = compiled(_dense_of)
+
+
+def normal_equations(jac, residual):
+    """`JᵀJ` and `Jᵀr`, by sparse products: nearly all of thousands of rows is 0, and
+    dense products take a minute."""
+    jac = scipy.sparse.csr_array(jac)
+    return (jac.T @ jac).toarray(), jac.T @ residual
+
+
+def factorised(matrix):
+    """The function that solves for right sides, by the sparse LU factors of SuperLU, of
+    a matrix that is positive definite."""
+    matrix = scipy.sparse.csc_array(matrix)
+    factors = scipy.sparse.linalg.splu(
+        matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+    )
+
+    def solve(right):
+        found = factors.solve(right)
+        # Without pivots for accuracy: one step of refinement brings it back.
+        return found + factors.solve(right - matrix @ found)
+
+    return solve
 
 
 def _bent_along(problem, state, way):

@@ -1,5 +1,6 @@
 """Small made-up scenes for the tests of graph and solver: truth, factors, a start."""
 
+import dataclasses
 import functools
 
 import jax
@@ -11,6 +12,7 @@ from own_factors import CameraSmoothness, StillFeet
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import load_body_model, local_keypoints
 from bodyslam_jax.geometry.camera import project
+from bodyslam_jax.solver.compilation import compiled
 
 INTRINSICS = np.array([600.0, 600.0, 320.0, 240.0])
 
@@ -96,12 +98,36 @@ def person_factors(rng, state, noise=1.0, correlation=0.9):
     """Keypoints, motion, postures and shape, as measured on the true state."""
     h, t = state.roots.shape[:2]
     body = body_model()
+    sigma = np.full((h, t, 25), 3.0)
+    sigma[rng.random(sigma.shape) < 0.1] = np.inf
+    shapes = {"rotation": (h, 1, 23, 3), "pixel": (h, t, 25, 2), "moved": (h, t, 3)}
+    draws = {name: noise * rng.standard_normal(s) for name, s in shapes.items()}
+    found = _measured(body, state, jax.tree.map(jnp.asarray, draws), correlation)
+    shape_sigma = np.full((h, t, 10), np.inf)
+    shape_sigma[:, 0] = 0.5
+    return [
+        g.KeypointReprojection(
+            body=body,
+            pixel=found["pixel"],
+            sigma=jnp.asarray(sigma),
+            loss=g.GemanMcClure(20.0),
+        ),
+        g.HumanMotion(**found["motion"]),
+        g.BodyPosePrior(
+            **found["posture"], sigma=jnp.asarray(np.full((h, t, 23), 0.15))
+        ),
+        g.ShapePrior(shape=found["shape"], sigma=jnp.asarray(shape_sigma)),
+    ]
+
+
+# In one program: one by one its operations take five times as long to compile.
+@compiled
+def _measured(body, state, draws, correlation):
+    """What `person_factors` measures, by the errors that it draws."""
+    h, t = state.roots.shape[:2]
     p_H = local_keypoints(body, state.poses, state.shapes[:, None], "body25")
     p_C = jnp.einsum("htij,htkj->htki", state.roots[..., :3, :3], p_H)
     pixel = project(state.intrinsics, p_C + state.roots[..., None, :3, 3])
-    normal = lambda *shape: jnp.asarray(rng.standard_normal(shape))
-    sigma = np.full((h, t, 25), 3.0)
-    sigma[rng.random(sigma.shape) < 0.1] = np.inf
     windows = g.HumanMotion(
         translation=jnp.zeros((h, t, 3)),
         whitening=jnp.zeros((h, t, 3, 3)),
@@ -110,37 +136,26 @@ def person_factors(rng, state, noise=1.0, correlation=0.9):
     moved = windows.map_frames(
         lambda d, w, s, _: g.displacement(w[1], w[0], s.scale), state
     )
-    valid = jnp.ones((h, t), bool).at[:, 0].set(False)
+    there = jnp.ones((h, t), bool)
+    valid = there.at[:, 0].set(False)
     covariance = jnp.diag(jnp.array([0.01, 0.02, 0.015]) ** 2)
     covariance = jnp.broadcast_to(covariance, (h, t, 3, 3))
     posture = g.retract_rotation(
-        state.poses, 0.05 * noise * normal(h, 1, 23, 3) * jnp.ones((1, t, 1, 1))
+        state.poses, 0.05 * draws["rotation"] * jnp.ones((1, t, 1, 1))
     )
-    there = jnp.ones((h, t), bool)
-    shape_sigma = np.full((h, t, 10), np.inf)
-    shape_sigma[:, 0] = 0.5
-    return [
-        g.KeypointReprojection(
-            body=body,
-            pixel=pixel + noise * normal(*pixel.shape),
-            sigma=jnp.asarray(sigma),
-            loss=g.GemanMcClure(20.0),
-        ),
-        g.HumanMotion(
-            translation=moved + 0.003 * noise * normal(h, t, 3),
-            whitening=g.whitening_of(covariance, valid),
-            correlation=g.ar1_correlation(valid, correlation),
-        ),
-        g.BodyPosePrior(
-            rotation=posture,
-            sigma=jnp.full((h, t, 23), 0.15),
-            correlation=g.ar1_correlation(there, correlation),
-        ),
-        g.ShapePrior(
-            shape=state.shapes[:, None] + jnp.zeros((h, t, 1)),
-            sigma=jnp.asarray(shape_sigma),
-        ),
-    ]
+    return {
+        "pixel": pixel + draws["pixel"],
+        "motion": {
+            "translation": moved + 0.003 * draws["moved"],
+            "whitening": g.whitening_of(covariance, valid),
+            "correlation": g.ar1_correlation(valid, correlation),
+        },
+        "posture": {
+            "rotation": posture,
+            "correlation": g.ar1_correlation(there, correlation),
+        },
+        "shape": state.shapes[:, None] + jnp.zeros((h, t, 1)),
+    }
 
 
 def landmark_prior(rng, state, seen=None):
@@ -229,8 +244,11 @@ def extra_factors(rng, state, seen=None):
 
 def perturb(rng, problem, state, size=0.02, scale=1.0):
     """A start off the truth, where the problem lets it move."""
-    draw = lambda x: size * jnp.asarray(rng.standard_normal(x.shape))
-    step = jax.tree.map(draw, state.zero_step())
-    step = jax.tree.map(lambda s, m: s * m, step, problem.free)
-    moved = state.retract(step)
-    return g.State(**{**vars(moved), "scale": state.scale * scale})
+    draw = lambda x: jnp.asarray(size * rng.standard_normal(x.shape))
+    moved = _moved(state, jax.tree.map(draw, state.zero_step()), problem.free)
+    return dataclasses.replace(moved, scale=state.scale * scale)
+
+
+@compiled
+def _moved(state, step, free):
+    return state.retract(jax.tree.map(jnp.multiply, step, free))

@@ -29,6 +29,7 @@ def test_a_limb_is_as_long_as_asked_and_nothing_else_changes(body):
     assert taller == pytest.approx(0.1 * longer, rel=0.05)
 
 
+@pytest.mark.slow
 def test_statures_are_those_of_the_population(body):
     person = Person(body, np.zeros(10))
     rng = np.random.default_rng(0)

@@ -122,6 +122,7 @@ def test_a_clear_deviation_is_decisive_at_a_tenth_of_the_odds(model, bend):
     assert best.log_odds - len(best.model) * np.log(10) > DECISIVE_LOG_ODDS
 
 
+@pytest.mark.slow
 def test_a_distorted_lens_is_decisive_and_its_standard_deviation_holds():
     def bend(uv, frame):
         q = (uv - CENTRE) / FOCAL

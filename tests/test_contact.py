@@ -244,6 +244,7 @@ def test_standing_feet_stop_sliding_and_nothing_else_changes():
     assert found.probability.shape == (1, 60, 4)
 
 
+@pytest.mark.slow
 def test_the_joint_problem_and_that_of_standing_feet_are_one_program(monkeypatch):
     """Their trees and shapes are equal, so that the second solve compiles nothing."""
     case = simulate_case("E2", frames=20, family="follow")

@@ -277,6 +277,7 @@ def test_the_worker_tells_every_kind_of_failure(tmp_path):
         assert judged(bad)["end"] == "bad"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of making inputs that are wrong
 def test_inputs_of_a_fixed_seed_end_in_a_result_or_a_line(tmp_path):
     fuzzing = Fuzzing(TARGETS, 20261127, tmp_path / "in", tmp_path / "failures")

@@ -16,7 +16,8 @@ from bodyslam_jax.graph import Variable
 from bodyslam_jax.solver import Stage, marginals, solve
 
 FRAMES = 12
-EXACT = (Stage(rtol=1e-14, max_steps=100),)
+# With no more steps than a history has rows, covariances share the program of a solve.
+EXACT = (Stage(rtol=1e-14, max_steps=64),)
 
 
 class Receiver(g.FrameFactor):
@@ -62,7 +63,7 @@ def make(people: int = 0, landmarks: int = 60, frames: int = FRAMES):
     return problem.with_factors(receiver(truth)), start, truth
 
 
-@pytest.mark.parametrize("people", [0, 1])
+@pytest.mark.parametrize("people", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_named_globals_are_estimated_with_their_covariance(people):
     problem, start, truth = make(people)
     found = solve(problem, start, schedule=EXACT)
@@ -121,6 +122,7 @@ def test_without_a_measurement_a_variable_stays_at_its_prior():
     np.testing.assert_allclose(state.landmarks, same.landmarks, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_solutions_differentiate_by_the_prior_of_a_variable():
     problem, start, _ = make(landmarks=20, frames=8)
     start = solve(problem, start, schedule=EXACT).state
@@ -157,6 +159,7 @@ def test_names_that_are_unknown_or_taken_are_refused():
         g.make_problem(problem.factors[:1], start)
 
 
+@pytest.mark.slow
 def test_variables_keep_single_precision():
     problem, start, _ = make(landmarks=20, frames=8)
     single = jax.tree.map(

@@ -10,7 +10,7 @@ import pytest
 import scenes
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
-from problems import dense, make, structured_step
+from problems import dense, make, normal_equations, structured_step
 
 import bodyslam_jax as bs
 import bodyslam_jax.graph as g
@@ -172,9 +172,8 @@ def test_prior_and_rest_have_the_normal_equations_of_the_whole(options):
     """Less what is gone, by dense linear algebra; and the solver steps by them."""
     problem, _, state = make(frames=20, **options)
     left = marginalise(problem, state, 10)
-    equations = lambda jac, r: (jac.T @ jac, jac.T @ r)
-    whole, slope = equations(*dense(problem, state))
-    part, part_slope = equations(*dense(left.problem, left.state))
+    whole, slope = normal_equations(*dense(problem, state))
+    part, part_slope = normal_equations(*dense(left.problem, left.state))
     place = ravel_pytree(state.zero_step())[1](jnp.arange(len(slope), dtype=float))
     place = dataclasses.replace(place, landmarks=place.landmarks[left.landmarks])
     place = np.asarray(ravel_pytree(place)[0]).astype(int)
@@ -214,10 +213,9 @@ def test_steps_far_from_the_first_estimates_are_those_of_the_prior_s_cost(
     assert bool(left.problem.factors[-1].invariant.all()) == (not gauge)
     rng = np.random.default_rng(0)
     away = scenes.perturb(rng, left.problem, left.state, size=0.2)
-    jacobian, residual = dense(left.problem, away)
-    part = jacobian.T @ jacobian
+    part, slope = normal_equations(*dense(left.problem, away))
     extra = np.where(np.diag(part) > 0, 1e-3 * np.diag(part), 1.0)
-    best = np.linalg.solve(part + np.diag(extra), -jacobian.T @ residual)
+    best = np.linalg.solve(part + np.diag(extra), -slope)
     step = structured_step(*pad(left.problem, away), jnp.asarray(1e-3))
     found, _ = ravel_pytree(remaining_step(step, left.state))
     np.testing.assert_allclose(found, best, atol=1e-8 * abs(best).max())

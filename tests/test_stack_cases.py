@@ -55,6 +55,7 @@ def test_lambda_of_a_stacked_case_is_its_own(cases):
             np.testing.assert_allclose(mapped, weight, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_cases_of_several_common_sizes_get_the_largest():
     """Of 15 and 40 frames, which alone are padded to 20 and 60."""
     cases = [make(seed=1, frames=n, landmarks=30)[::2] for n in (15, 40)]

@@ -252,6 +252,7 @@ def test_the_cost_does_not_depend_on_the_unit_of_the_map(built):
     assert larger.cost(start) > problem.cost(state) + 1
 
 
+@pytest.mark.slow
 def test_a_batch_of_factors_is_a_batch_of_problems(built):
     problem, state = built
     problems, states = bs.rescaled(problem, state, jnp.array([0.5, 2.0]))

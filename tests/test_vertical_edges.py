@@ -80,6 +80,7 @@ def test_errors_agree_with_the_covariance_among_edges_of_any_direction():
     assert 0.1 < np.mean(chi2) < 3.0  # 2 by a covariance that is right
 
 
+@pytest.mark.slow
 def test_edges_of_any_direction_have_no_vertical():
     """Neither the same in all images, nor others in each."""
     number = 0
