@@ -78,6 +78,7 @@ POSE_SIGMA = (0.01, 0.02)
 NOISE, FRAMES_ALIKE = 0.012, 9
 """Error of a keypoint, m, and the number of frames that share it, at 60 fps."""
 REFINEMENTS = 30
+FIGURES = ("pa", "mpjpe", "scaled", "size", "along", "across", "lasting", "frames")
 CONFIG = Config(overlay=False)
 
 
@@ -307,7 +308,7 @@ def aligned(
 ]:
     """The estimate after the best similarity of each frame to the known joints, its
     rotation and its scale."""
-    known = np.isfinite(true).all(axis=-1)[..., None]
+    known = np.isfinite(true).all(axis=-1, keepdims=True)
     count = known.sum(axis=1, keepdims=True)
     y_mean = np.where(known, true, 0).sum(axis=1, keepdims=True) / count
     x_mean = np.where(known, found, 0).sum(axis=1, keepdims=True) / count
@@ -340,7 +341,7 @@ def offsets(rows: list[Compared]) -> Float[np.ndarray, "12 3"]:
     return found
 
 
-def figures(row: Compared, shift: Float[np.ndarray, "12 3"]) -> dict[str, object]:
+def figures(row: Compared, shift: Float[np.ndarray, "12 3"]) -> dict[str, float]:
     """Errors of one row, mm, with the joints of the estimate moved by `shift`, m."""
     valid = row.valid
     true = row.true[valid]
@@ -370,8 +371,8 @@ def figures(row: Compared, shift: Float[np.ndarray, "12 3"]) -> dict[str, object
         "along": rms(along),
         "across": rms(across) / np.sqrt(2),
         "lasting": rms(np.nanmean(left, axis=0)),
-        "parts": 1e3 * np.nanmean(by_part, axis=(0, 1)),
-        "frames": int(valid.sum()),
+        "frames": float(valid.sum()),
+        **dict(zip(PARTS, 1e3 * np.nanmean(by_part, axis=(0, 1)))),
     }
 
 
@@ -466,8 +467,8 @@ def draw(row: Compared, view: View, folder: Path) -> None:
 def _lines(image, uv, lines, colour) -> None:
     for a, b in lines:
         if np.isfinite(uv[[a, b]]).all():
-            ends = [tuple(int(v) for v in uv[i]) for i in (a, b)]
-            cv2.line(image, *ends, colour, 4, cv2.LINE_AA)
+            start, end = (tuple(int(v) for v in uv[i]) for i in (a, b))
+            cv2.line(image, start, end, colour, 4, cv2.LINE_AA)
 
 
 def main() -> None:
@@ -513,30 +514,20 @@ def main() -> None:
 
 def report(rows: list[Compared], shifts: list[Float[np.ndarray, "12 3"]]) -> None:
     """Prints a line for each row, and their means."""
-    found = [figures(row, shift) for row, shift in zip(rows, shifts)]
-    names = [n for n in found[0] if n != "parts"] if found else []
-    if not found:
+    if not rows:
         return
-    print("| view |", " | ".join([*names, *PARTS]), "| focal, px | status |")
+    found = [figures(row, shift) for row, shift in zip(rows, shifts)]
+    print("| view |", " | ".join([*FIGURES, *PARTS]), "| focal, px | status |")
+    cells = lambda row: [
+        *(f"{row[n]:.3f}" if n == "size" else f"{row[n]:.0f}" for n in FIGURES),
+        *(f"{row[part]:.0f}" for part in PARTS),
+    ]
     for row, one in zip(rows, found):
-        cells = [f"{one[n]:.3f}" if n == "size" else f"{one[n]:.0f}" for n in names]
-        cells += [f"{x:.0f}" for x in one["parts"]]  # pyright: ignore
-        status = row.result.summary["status"]
-        print(
-            f"| {row.view} |",
-            " | ".join(cells),
-            f"| {row.result.intrinsics[0]:.0f} | {status} |",
-            flush=True,
-        )
+        last = f"| {row.result.intrinsics[0]:.0f} | {row.result.summary['status']} |"
+        print(f"| {row.view} |", " | ".join(cells(one)), last, flush=True)
     if len(found) > 1:
-        cells = [
-            f"{np.mean([one[n] for one in found]):.3f}"
-            if n == "size"
-            else f"{np.mean([one[n] for one in found]):.0f}"
-            for n in names
-        ]  # pyright: ignore
-        cells += [f"{x:.0f}" for x in np.mean([one["parts"] for one in found], axis=0)]  # pyright: ignore
-        print("| mean |", " | ".join(cells), "| | |")
+        mean = {n: float(np.mean([one[n] for one in found])) for n in found[0]}
+        print("| mean |", " | ".join(cells(mean)), "| | |")
 
 
 if __name__ == "__main__":

@@ -76,7 +76,7 @@ def walks(folder: Path) -> None:
     data = dict(np.load(folder / "cmu_locomotion.npz", allow_pickle=False))
     keep = np.isin(data["seq_name"], TRIALS) & (data["seq_phase"] == 0)
     keep &= (data["seq_split"] == "val") & (data["seq_source"] == "kc-amc")
-    rows = list(np.flatnonzero(keep))
+    rows = np.flatnonzero(keep).tolist()
     if len(rows) != len(TRIALS):
         raise ValueError(f"{folder}: found {len(rows)} of the {len(TRIALS)} trials.")
     write("walking.npz", chosen(data, rows, [0] * len(rows), max(data["seq_length"])))
@@ -87,7 +87,7 @@ def others(folder: Path) -> None:
     for name in ("other", "more"):
         data = dict(np.load(folder / f"cmu_{name}.npz", allow_pickle=False))
         keep = np.isin(data["seq_name"], wanted) & (data["seq_phase"] == 0)
-        rows = list(np.flatnonzero(keep & np.isin(data["seq_subject"], HELD_OUT)))
+        rows = np.flatnonzero(keep & np.isin(data["seq_subject"], HELD_OUT)).tolist()
         first = [OTHER_FROM[n] for n in data["seq_name"][rows]]
         parts.append(chosen(data, rows, first, OTHER_FRAMES))
     new = joined(parts)
