@@ -8,7 +8,6 @@ the scale of a robust loss: λ = σ^-2, so log λ decreases by twice as much.
 
 import dataclasses
 import logging
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -46,18 +45,6 @@ WEIGHTS: dict[str, tuple[type[graph.Factor], str]] = {
     "landmarks loss": (graph.Reprojection, "loss"),
 }
 """The field of a factor that each weight multiplies, by the name of its term."""
-_RENAMED = {
-    "keypoint": "keypoints",
-    "keypoint loss": "keypoints loss",
-    "motion": "human_motion",
-    "posture": "body_pose",
-    "orientation": "root_orientation",
-    "turning": "angular_acceleration",
-    "smooth path": "root_smoothness",
-    "landmark": "landmarks",
-    "landmark loss": "landmarks loss",
-}
-"""Terms by their names in files written before terms had one name everywhere."""
 SCALE_UNIT, JOINT_UNIT_M = 0.05, 0.05
 """Units of the training error: of log s, and of J-ATE."""
 SCHEDULE = (solver.Stage(),)
@@ -128,10 +115,6 @@ def reweighted(
 
     **Raises:** `InputError` for a name that is not among `WEIGHTS`.
     """
-    for old in [name for name in names if name in _RENAMED]:
-        text = f"weights: {old!r} is called {_RENAMED[old]!r} now."
-        warnings.warn(text, DeprecationWarning, stacklevel=2)
-    names = [_RENAMED.get(name, name) for name in names]
     unknown = set(names) - set(WEIGHTS)
     if unknown:
         raise InputError(f"weights {sorted(unknown)}, expected of {list(WEIGHTS)}.")
