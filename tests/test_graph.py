@@ -230,7 +230,22 @@ def test_every_residual_has_the_derivative_of_finite_differences(rng):
         g.FootContact,
         g.RootOrientation,
         g.AngularAccelerationPrior,
+        g.RootSmoothness,
     }
+
+
+def test_residuals_of_all_frames_at_once_are_those_of_each_frame(rng):
+    factors, state = every_factor(rng)
+    factors = [f for f in factors if isinstance(f, g.FrameFactor)]
+
+    @jax.jit
+    def both():
+        each = [g.FrameFactor.residual(factor, state) for factor in factors]
+        return each, [factor.residual(state) for factor in factors]
+
+    for factor, each, found in zip(factors, *both(), strict=True):
+        size = 1 + jnp.abs(each).max()
+        assert jnp.abs(found - each).max() < 1e-11 * size, type(factor).__name__
 
 
 def along(factor, state, step):

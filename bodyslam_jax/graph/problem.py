@@ -150,8 +150,9 @@ class Problem(eqx.Module):
             "valid": getattr(found, "valid", None),
         }
         # What no factor takes is left out, so that it is not computed.
-        for name in {_predicted_by(factor) for factor in self.factors} - {None}:
-            prediction[name] = getattr(found, name)
+        for name in map(_predicted_by, self.factors):
+            if name is not None:
+                prediction[name] = getattr(found, name)
         return prediction
 
     def with_prediction(self, prediction: Any) -> "Problem":

@@ -55,14 +55,17 @@ class RootSmoothness(FrameFactor):
         return (now - 2 * before + first) / unit_length(self.body, shared) / sigma
 
     def residual(self, state: State) -> Float[Array, "h t 3"]:
-        leg = unit_lengths(self.body, state)
-        sigma = (leg[:, None] * self.sigma)[..., None]
-        return _bend(pelvis_in_world(state)) / sigma
+        return self._whitened(_bend(pelvis_in_world(state)), state)
+
+    def _whitened(self, x: Float[Array, "h t *b"], state: State) -> Array:
+        """Returns `x / (L σ)`. Division by σ comes last: the derivative of `L σ` by the
+        shape is infinite where σ is."""
+        after = (..., *(None,) * (x.ndim - 2))
+        leg = unit_lengths(self.body, state)[:, None]
+        return x / leg[after] / self.sigma[after]
 
     def jacobians(self, state):
-        leg = unit_lengths(self.body, state)
-        sigma = (leg[:, None] * self.sigma)[..., None]
-        residual = _bend(pelvis_in_world(state)) / sigma
+        residual = self.residual(state)
         camera = jnp.broadcast_to(state.cameras, state.roots.shape)
         C, r_WC = camera[..., :3, :3], camera[..., :3, 3]
         by_rotation = by_rotation_of(C, state.roots[..., :3, 3])
@@ -72,15 +75,17 @@ class RootSmoothness(FrameFactor):
             "camera": join(by_rotation, state.scale * eye),
             "root": join(jnp.zeros_like(C), C),
         }
-        parts: dict[Key, Array] = {("scale", 0): (_bend(r_WC) / sigma)[..., None]}
+        parts: dict[Key, Array] = {
+            ("scale", 0): self._whitened(_bend(r_WC), state)[..., None]
+        }
         for name, part in of_frame.items():
             for lag, factor in enumerate((1.0, -2.0, 1.0)):
-                parts[name, lag] = factor * part / sigma[..., None]
+                parts[name, lag] = factor * self._whitened(part, state)
                 part = previous_frame(part)
         by_shape = unit_lengths_by_shape(self.body, state)
         if by_shape is not None:
-            longer = (by_shape / leg[:, None])[:, None, None]
-            parts["shape", 0] = -residual[..., None] * longer
+            longer = by_shape / unit_lengths(self.body, state)[:, None]
+            parts["shape", 0] = -residual[..., None] * longer[:, None, None]
         return residual, parts
 
 

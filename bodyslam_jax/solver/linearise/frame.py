@@ -216,8 +216,8 @@ def _add_products(sums: Sums, group: list[Rows]) -> None:
             if before or ((name, lag), there) not in coupled:
                 continue
             block = shift(gram[..., here, parts[there]], lag)
-            key = (name, other) if of_people else ("alone", "alone")
-            sums.add((*key, other_lag - lag), squeeze(block))
+            row, column = (name, other) if of_people else ("alone", "alone")
+            sums.add((row, column, other_lag - lag), squeeze(block))
         if has_common:
             block = shift(gram[..., here, spread], lag)
             sums.add((name if of_people else "alone", "globals", 0), squeeze(block))
