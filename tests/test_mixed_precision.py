@@ -8,6 +8,7 @@ import pytest
 import scenes
 from problems import dense, make
 
+from bodyslam_jax.geometry.lengths import LENGTHS
 from bodyslam_jax.solver import Stage, clock, solve, trace
 from bodyslam_jax.solver.blocks import LandmarkBlocks
 from bodyslam_jax.solver.compilation import quick_options
@@ -15,7 +16,7 @@ from bodyslam_jax.solver.elimination.schur import half_inverse
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.padding import pad
-from bodyslam_jax.solver.solve import is_mixed, method_of, run
+from bodyslam_jax.solver.solve import MIN_MIXED_FRAMES, is_mixed, method_of, run
 from bodyslam_jax.solver.step import Trial
 
 TIGHT = (Stage(rtol=1e-12, max_steps=60),)
@@ -193,8 +194,9 @@ def test_the_least_damping_rises_where_a_factorisation_failed():
 
 def test_the_default_is_single_precision_for_long_problems_without_people():
     zero = lambda people, frames: scenes.truth(np.random.default_rng(0), frames, people)
-    assert is_mixed(None, zero(0, 100))
-    assert not is_mixed(None, zero(0, 99))
-    assert not is_mixed(None, zero(1, 100))
-    assert not is_mixed(False, zero(0, 100))
+    assert is_mixed(None, zero(0, 61))
+    assert not is_mixed(None, zero(0, 60))
+    assert not is_mixed(None, zero(1, 61))
+    assert not is_mixed(False, zero(0, 61))
     assert is_mixed(True, zero(1, 7))
+    assert MIN_MIXED_FRAMES - 1 in LENGTHS  # no size has two programs
