@@ -161,7 +161,7 @@ class StructuredLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         cost = jnp.sum(terms)
         found = before - cost > enough
         done = done & ~found
-        least_possible = trial.next_least(state.least_damping)
+        least_possible = trial.next_least(state.least_damping, self.dtype)
         damping = trial.next_damping(state.nu, least_possible)
         stuck = ~accept & ~done & ~found & (damping > MAX_DAMPING)
         broken = ~jnp.isfinite(known)

@@ -29,9 +29,10 @@ from bodyslam_jax.solver.solution import Solution, only, outcome
 
 HISTORY_LENGTH_UNIT = 64
 """Number of rows of a history is a multiple of this: schedules share a compilation."""
-MIN_MIXED_FRAMES = 100
+MIN_MIXED_FRAMES = 61
 """Number of frames from which on the steps of a problem without people are found in
-single precision by default: below, they take milliseconds."""
+single precision by default: below, they take milliseconds. It is just above a common
+size (`geometry/lengths.py`), so that no size has two programs."""
 
 
 def solve(
@@ -58,7 +59,8 @@ def solve(
     - `mixed_precision`: `structured` solves for its steps in single precision, which
       takes two thirds to four fifths of the time; residuals, gradients, costs and
       landmarks' own blocks, and so the minimum, keep the precision of `state`. By
-      default problems without people of `MIN_MIXED_FRAMES` or more.
+      default those without people, of more than 60 frames, do. Covariances are of
+      factors in double precision, which is another program to compile.
 
     Pure: jits, differentiates, and maps over problems or states of one shape: one after
     another on a CPU, which is no slower there, at once elsewhere; `vmap_over_devices`

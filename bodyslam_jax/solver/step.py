@@ -4,7 +4,7 @@ Marquardt's damping, in proportion to each variable's own curvature, with Nielse
 update. Landmarks whose cost the step would have increased are damped individually.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,9 +62,12 @@ class Trial(NamedTuple):
     landmark_damping: Float[Array, " l"]
     """Damping of individual landmarks for the next step."""
 
-    def next_least(self, least: Float[Array, ""]) -> Float[Array, ""]:
-        """Returns the least damping of later steps: higher where rounding left the
-        equations without a factorisation, so that they do not fail again."""
+    def next_least(self, least: Float[Array, ""], dtype: Any) -> Float[Array, ""]:
+        """Returns the least damping of later steps with factors of this precision: in
+        single precision it is higher where rounding left the equations without a
+        factorisation, so that they do not fail again."""
+        if dtype == jnp.float64:
+            return least
         failed = jnp.minimum(FAILED_DAMPING_FACTOR * self.damping, MAX_LEAST_DAMPING)
         return jnp.where(self.finite, least, jnp.maximum(least, failed))
 
