@@ -11,17 +11,12 @@ process exceeds `_MEMORY`.
 import gc
 import os
 import sys
-import threading
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import jaxlib.version
-import numpy as np
 import pytest
-from jax._src.interpreters import mlir
-from jax._src.lax.lax import stage_p
-from jaxlib.mlir import ir
 
 if jaxlib.version.__version__.startswith("0.10."):
     # As the package compiles its own large programs: compiling is what most tests wait
@@ -52,39 +47,6 @@ if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 # As in the command: Python's 700 new objects cost a seventh of tracing time.
 gc.set_threshold(50_000)
-_new_context = mlir.make_ir_context
-_shared = threading.local()
-
-
-def _context():
-    """One MLIR context for all programs of a thread, which take a third less time to
-    lower so if they are small; within the lowering of another program a new one."""
-    if ir.Context.current is not None:
-        return _new_context()
-    if not hasattr(_shared, "context"):
-        _shared.context = _new_context()
-    return _shared.context
-
-
-mlir.make_ir_context = _context
-_stage = stage_p.impl
-
-
-def _put(x):
-    """As `jnp.asarray` of a NumPy array, which compiles a program for each shape: a
-    third of all programs of the tests."""
-    return jax.device_put(x.copy()) if isinstance(x, np.ndarray) else _stage(x)
-
-
-stage_p.def_impl(_put)
-
-
-@pytest.fixture
-def compiles_as_usual():
-    """`jnp.asarray` compiles as for users, for a test of what is compiled."""
-    stage_p.def_impl(_stage)
-    yield
-    stage_p.def_impl(_put)
 
 
 def pytest_collection_modifyitems(items):
@@ -97,7 +59,6 @@ def drop_programs() -> None:
     """Frees compiled programs and what was traced for them."""
     eqx.clear_caches()
     jax.clear_caches()
-    vars(_shared).clear()
     gc.collect()
 
 

@@ -539,7 +539,6 @@ def test_a_window_mends_what_came_while_it_was_busy():
     assert ratio.max() < 1.08 * ratio.min()
 
 
-@pytest.mark.usefixtures("compiles_as_usual")
 @pytest.mark.slow
 def test_a_late_window_takes_all_in_and_compiles_nothing(long_walk):
     sequence, truth = long_walk
