@@ -246,7 +246,9 @@ def test_the_cost_does_not_depend_on_the_unit_of_the_map(built):
     for factor in FACTORS:
         found = costs_of(factor)
         for term, cost in expected.items():
-            np.testing.assert_allclose(found[term], cost, rtol=1e-9, atol=1e-20, err_msg=term)
+            np.testing.assert_allclose(
+                found[term], cost, rtol=1e-9, atol=1e-20, err_msg=term
+            )
     assert {"ground", "landmark_prior"} <= set(expected)
     larger, start = bs.rescaled(problem, state, 2.0)
     assert larger.cost(start) > problem.cost(state) + 1
