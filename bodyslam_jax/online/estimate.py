@@ -55,12 +55,15 @@ class Estimate:
     located: bool
     people: tuple[PersonEstimate, ...]
     scale: float
-    """m per map unit; NaN as long as nobody told it."""
+    """m per map unit; NaN as long as nobody told it. 1 where `fixed`."""
     scale_sigma: float
-    """Standard deviation of `scale`; NaN with it."""
+    """Standard deviation of `scale`; NaN with it. Where `fixed` that of people's sizes,
+    relative."""
     status: str
-    """`starting`: no map yet; `tracking`; `lost`: the camera fits the map nowhere;
-    `late`: the frame was not used, as its time is not after that of the last one."""
+    """`starting`: no map yet; `tracking`; `fixed`: the camera stands still or only
+    turns, and people's sizes alone tell metres; `lost`: the camera fits the map
+    nowhere; `late`: the frame was not used, as its time is not after that of the last
+    one."""
     notes: tuple[str, ...]
     """What to know about it, a line each."""
     latency: float
@@ -89,6 +92,12 @@ class World:
     """The trunks of each frame of the last window, by its number."""
     height: float | None = None
     """Of the first camera over the floor, m."""
+
+    def next_map(self) -> None:
+        """Goes on in a map whose first camera is where it is here; its unit, and so the
+        scale, is another one."""
+        sums = np.array(list(self.inside.values())).reshape(-1, 3)
+        self.trunks, self.inside = self.trunks + sums.sum(axis=0), {}
 
     def camera(self, T_WC: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
         """A camera of the map in the metric world."""

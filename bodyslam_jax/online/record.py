@@ -1,8 +1,9 @@
 """What is remembered of a running video, and the result that is made of it at the end.
 
-Of every frame: its time, where it is relative to a frame of the window, and people's
-keypoints; of the frames of the window, as they leave it: camera, roots and postures. No
-image is kept. Half a kilobyte a frame, one more for each person.
+Of every frame: its time, where it is relative to a frame of the window, people's
+keypoints, and, for a last offline pass, points (2.5 kB); of the frames of the window,
+as they leave it: camera, roots and postures. No image is kept. Half a kilobyte a frame,
+one more for each person.
 """
 
 import dataclasses
@@ -42,6 +43,8 @@ class Seen:
     """From its camera to that frame's, map units."""
     located: bool
     people: dict[int, Float[np.ndarray, "25 3"]]
+    points: tuple[np.ndarray, np.ndarray] | None = None
+    """Numbers and pixels of points of the scene, if they are kept."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +102,12 @@ class Record:
         self.landmarks: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
         """By map and track: a frame of the window that saw it, and map units."""
         self.shapes: dict[int, np.ndarray] = {}
+        self.shape_covariances: dict[int, np.ndarray] = {}
+        self.fixed: dict[int, str] = {}
+        """Maps whose camera stands still or only turns: `static` or `rotation`."""
+        self.joins: dict[int, tuple[tuple[int, int], np.ndarray]] = {}
+        """Of a map that goes on where the camera of another one began to move: map and
+        slot there, and the first camera from that one's, m."""
         self.pixel_sigma = 0.7
 
     def keep(self, number: int, solved: Solved) -> None:
@@ -125,11 +134,41 @@ class Record:
         for h, person in enumerate(solved.people):
             if person is not None and solved.present[h].any():
                 self.shapes[person] = solved.shapes[h]
-        told = first + len(solved.times) - 1, solved.scale, solved.scale_sigma
+                self.shape_covariances[person] = solved.shape_covariance[h]
+        sigma = float("nan") if solved.fixed else solved.scale_sigma
+        told = first + len(solved.times) - 1, solved.scale, sigma
         self.scales.setdefault(number, []).append(told)
         for track, place in solved.landmarks.items():
             if len(self.landmarks) < _MOST_LANDMARKS:
                 self.landmarks[number, track] = told[0], place.copy()
+
+    def join(self, number: int, frames: int) -> None:
+        """Lets map `number` begin with the last so many frames, which the map before it
+        has too: that one ends there."""
+        first = self.frames[len(self.frames) - frames]
+        del self.frames[len(self.frames) - frames :]
+        self.joins[number] = (first.map, first.slot), first.since
+        # One more, as frames lie between two.
+        for of, slot in list(self.slots):
+            if of == first.map and slot > first.slot + 1:
+                del self.slots[of, slot]
+
+    def measured(
+        self, intrinsics: Intrinsics, name: str, warnings: tuple[str, ...]
+    ) -> Sequence:
+        """All that was measured and kept, as the input of an offline run: everybody
+        who was seen, and points if they were kept."""
+        persons = sorted({person for frame in self.frames for person in frame.people})
+        times = np.array([frame.time for frame in self.frames])
+        return Sequence(
+            name=name,
+            frames=None,
+            timestamps=times - times[0],
+            intrinsics=intrinsics,
+            keypoints=_keypoints(self, persons),
+            tracks=_tracks(self),
+            warnings=warnings,
+        )
 
     def pass_over(self, number: int, slot: int, measured: Measured) -> None:
         """Keeps the camera of a frame that the window does not get."""
@@ -177,7 +216,8 @@ def parts_of(
     """All frames as the stages of an offline run hand them on: what was measured, the
     cameras, and the estimate; `fps` is that of the frames of the window."""
     path = _path(record, fps)
-    told = record.scales[max(record.scales)] if record.scales else []
+    moving = [number for number in record.scales if number not in record.fixed]
+    told = record.scales[max(moving)] if moving else []
     _, scales, sigma = smoothed_scales(told, fps)
     scale = float(scales[-1])
     T_WC, located = _cameras(record, path)
@@ -202,7 +242,7 @@ def parts_of(
     )
     none = np.zeros(0, int)
     sfm = SfmResult(
-        kind="moving" if record.scales else "static",
+        kind="moving" if moving else _kind_of_fixed(record),
         T_WC=cameras,
         registered=located,
         landmarks=landmarks / scale,
@@ -222,8 +262,10 @@ def parts_of(
     joint = JointEstimate(
         scale=scale,
         start=start,
-        scale_sigma=sigma if np.isfinite(sigma) else float("inf"),
-        shape_covariance=np.full((len(persons), 10, 10), np.nan),
+        scale_sigma=sigma if np.isfinite(sigma) or not moving else float("inf"),
+        shape_covariance=np.array(
+            [record.shape_covariances[p] for p in persons]
+        ).reshape(-1, 10, 10),
         unobserved=(),
         cameras=cameras,
         roots=roots,
@@ -237,6 +279,11 @@ def parts_of(
         contacts=contacts,
     )
     return measured, sfm, joint
+
+
+def _kind_of_fixed(record: Record) -> str:
+    """What the camera is said to do where no map was found: to turn, if it ever did."""
+    return "rotation" if "rotation" in record.fixed.values() else "static"
 
 
 def _path(record: Record, fps: float) -> _Path:
@@ -258,7 +305,9 @@ def _path(record: Record, fps: float) -> _Path:
         T[:, :3, 3] = T[0, :3, 3] * s[0] + np.concatenate(
             [np.zeros((1, 3)), np.cumsum(steps, axis=0)]
         )
-        into = end @ np.linalg.inv(T[0])
+        before, since = record.joins.get(number, ((number, 0), np.eye(4)))
+        start = poses[before] @ since if before in poses else end
+        into = start @ np.linalg.inv(T[0])
         for k, pose, value in zip(slots, T, s, strict=True):
             poses[number, k] = into @ pose
             scale_at[number, k] = float(value)
@@ -303,6 +352,20 @@ def _keypoints(record: Record, persons: list[int]) -> Keypoints | None:
         for h, person in enumerate(persons):
             found[h, t] = frame.people.get(person, 0.0)
     return Keypoints(found[..., :2], found[..., 2])
+
+
+def _tracks(record: Record) -> Tracks | None:
+    kept = [
+        (k, *frame.points)
+        for k, frame in enumerate(record.frames)
+        if frame.points is not None
+    ]
+    if not kept:
+        return None
+    frame = np.concatenate([np.full(len(ids), k) for k, ids, _ in kept])
+    number = np.concatenate([ids for _, ids, _ in kept])
+    uv = np.concatenate([pixels for _, _, pixels in kept]).astype(float)
+    return Tracks(frame, np.unique(number, return_inverse=True)[1].reshape(-1), uv)
 
 
 def _people(

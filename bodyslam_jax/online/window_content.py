@@ -88,12 +88,19 @@ class Content:
         self.known = np.zeros((places, FRAMES), bool)
         """Where roots and poses are those of a solve."""
         self.shapes = np.zeros((places, 10))
+        self.shape_covariance = np.full((places, 10, 10), np.nan)
+        """By the last solve that computed it."""
         self.people: list[int | None] = [None] * places
         self.began = np.zeros(places, int)
         """Frame in which each person's shape is measured."""
         self.book: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         """Shape, and its standard deviations, of people who were here."""
+        self.fixed = False
+        """Whether the camera stands still or only turns: its poses are held, there are
+        no landmarks, and metres come from people's sizes alone."""
         self.scale, self.scale_sigma = 1.0, float("nan")
+        self.size_sigma = float("nan")
+        """Relative standard deviation of people's sizes, where `fixed`."""
         self.pixel_sigma = _SIGMA
         self.steps_told = np.zeros(places)
         """Information of marginalised steps on their common factor."""
@@ -135,8 +142,9 @@ class Content:
         for k, frame in enumerate(frames, start=at):
             self.cameras[k:] = frame.T_WC
             self.located[k] = frame.located
-            self.free[k] = float(frame.located and len(frame.ids) > 0)
-            self.seen[k] = self._landmarks_of(k, frame) if frame.located else _NOTHING
+            shown = frame.located and len(frame.ids) > 0 and not self.fixed
+            self.free[k] = float(shown)
+            self.seen[k] = self._landmarks_of(k, frame) if shown else _NOTHING
             self.known[:, k:] = False
             self.uv[:, k:], self.confidence[:, k:] = 0.0, 0.0
             for person, points in frame.people.items():
@@ -203,6 +211,7 @@ class Content:
         self.uv[h], self.confidence[h] = 0.0, 0.0
         self.roots[h], self.poses[h] = np.eye(4), 0.0
         self.shapes[h] = self._known_shape(person)
+        self.shape_covariance[h] = np.nan
         return h
 
     def _known_shape(self, person: int | None) -> Float[np.ndarray, " 10"]:

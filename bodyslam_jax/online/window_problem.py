@@ -24,9 +24,11 @@ from bodyslam_jax.online.window_content import FRAMES, PRIOR, Content
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.pipeline.motion_prediction import (
     contact_predictor,
+    contact_probability,
     motion_predictor,
     predict,
 )
+from bodyslam_jax.pipeline.people_floor import View, on_floor
 from bodyslam_jax.solver.marginalisation import in_frames
 from bodyslam_jax.types import Keypoints, ScaleStart, Sequence, Tracks
 
@@ -46,6 +48,9 @@ _GROUND_COUNTS = 10.0
 _DEFINITION = "unknown"
 """What the detector calls a hip or a knee (`Keypoints.definition`)."""
 _NOWHERE = np.full(3, np.nan)
+_NO_WEIGHT = 1e6
+"""px: standard deviation of the observation that stands for none, so that a window
+without landmarks has the tables, and the programs, of all others."""
 _ROOM = 540
 """Landmarks that the tables of a window hold, partly filled as they are."""
 _VARIABLES = ("scale", "cameras", "roots", "poses", "shapes", "landmarks")
@@ -111,11 +116,17 @@ def make(
     weights = window.config.weights
     measured = np.arange(FRAMES) >= CHUNK
     tracks, places = _tracks(window)
+    shown = len(places) > 0
+    if not shown:
+        tracks, places = _one_ahead(window)
     state = eqx.tree_at(lambda s: s.landmarks, state, put(places))
     sigma = initialisation.landmark_sigma(window.pixel_sigma, weights)
     cameras = initialisation.map_factor(
         tracks, np.ones(len(tracks.frame), bool), sigma, weights
     )
+    if not shown:
+        none = jnp.full_like(cameras.sigma, _NO_WEIGHT)
+        cameras = eqx.tree_at(lambda f: f.sigma, cameras, none)
     of_people = [
         _shape_once(window, f, roots) if isinstance(f, graph.ShapePrior) else f
         for f in initialisation.people_factors(sequence, roots, weights, window.body)
@@ -144,6 +155,8 @@ def make(
         nothing = priors.no_prior(state, PRIOR, 2)
         window.prior = priors.with_scale(nothing, window.scale_sigma)
     metric = np.isfinite(window.scale_sigma) or bool((told > 0).any())
+    if window.fixed:  # The floor's height is s times a constant.
+        metric = bool(np.isfinite(np.asarray(ground.sigma)).any())
     free = dataclasses.replace(state, landmarks=put(places[:0])).zero_step()
     ones = lambda x, mask: jnp.ones_like(x) * jnp.asarray(mask, x.dtype)
     past = np.asarray(np.arange(FRAMES) >= CHUNK - window.prior.reach)
@@ -157,7 +170,7 @@ def make(
         roots=ones(free.roots, (there & past)[..., None]),
         poses=ones(free.poses, (there & last)[..., None, None]),
         shapes=ones(free.shapes, np.asarray(there.any(axis=1))[:, None]),
-        landmarks=put(np.ones(places.shape)),
+        landmarks=put(np.full(places.shape, float(shown))),
     )
     problem = graph.make_problem(
         [*factors, window.prior],
@@ -171,7 +184,7 @@ def make(
     problem = dataclasses.replace(problem, variables=variables)
     if problem.layout.num_chunks != FRAMES // CHUNK:
         log.warning("a window's landmarks fit in no table of its size")
-    return problem, state, told if metric else told[:0]
+    return problem, state, told if metric and not window.fixed else told[:0]
 
 
 def _tracks(
@@ -210,6 +223,14 @@ def _tracks(
     number = np.cumsum(good) - 1
     window.in_graph = known[good]
     return Tracks(frame[rows], number[row[rows]], uv[rows]), places[good]
+
+
+def _one_ahead(window: Content) -> tuple[Tracks, Float[np.ndarray, "1 3"]]:
+    """A landmark ahead of the first measured camera, and that it is seen there."""
+    T_WC = window.cameras[CHUNK]
+    middle = np.asarray(window.intrinsics.params[2:4], float)
+    seen = np.array([CHUNK]), np.array([0]), middle[None]
+    return Tracks(*seen), (T_WC[:3, 3] + T_WC[:3, 2])[None]
 
 
 def _shape_once(
@@ -278,6 +299,8 @@ def _ground(
         jnp.full((window.places, FRAMES), jnp.inf),
     )
     present = roots.present & window.located & legs & measured
+    if window.fixed:
+        return _floor(window, sequence, state, present) or blank, state
     contact = None
     if present.sum() >= CHUNK:
         contact = initialisation.ground_contact(
@@ -304,6 +327,23 @@ def _ground(
     # `sigma` is that of all frames together times the root of their number.
     sigma = sigma / np.sqrt(count) * np.sqrt(count / grown)
     return eqx.tree_at(lambda f: f.sigma, contact, jnp.asarray(sigma)), state
+
+
+def _floor(
+    window: Content, sequence: Sequence, state: graph.State, present: np.ndarray
+) -> graph.GroundContact | None:
+    """The floor of people before a camera that is held, as offline: one plane, whose
+    height is told by their sizes alone. `None` without feet that stand."""
+    weights = window.config.weights
+    if weights.ground_sigma is None or not present.any():
+        return None
+    probability = None
+    if window.stands is not None:
+        stands = dataclasses.replace(window.stands, present=jnp.asarray(present))
+        probability = contact_probability(stands, state, window.fps)
+    fitted = np.ones(window.places, bool)
+    seen = present, sequence.keypoints, fitted, window.fps, window.config.gravity
+    return on_floor(state, probability, View(*seen), window.body, weights)
 
 
 def _most(good: np.ndarray, seen: np.ndarray, most: int) -> np.ndarray:

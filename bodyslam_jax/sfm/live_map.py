@@ -32,6 +32,9 @@ _FIRST_SHARE = 0.7
 """Share of the tracks that two views must explain."""
 _WAIT = 240
 """Frames that are kept while two views are looked for."""
+_LAGS = (15, 30, 60)
+"""Frames ago of further views that are tried once more frames wait: few points are
+followed for longer."""
 _EVERY, _LEFT = 5, 0.7
 """A keyframe is every so many frames, and where less of the last one's points are
 left."""
@@ -46,6 +49,9 @@ _OFF = 0.25
 """Share of views that a new point may not fit: tracks have outliers."""
 _ROTATED = 2.0
 """px: median distance from a pure turn up to which two views have no parallax."""
+CERTAIN_PARALLAX = 6.0
+"""px: the same where the camera turned or stood before: noise of tracks and a wrong
+focal length together stay below it, as offline (`sfm`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +74,8 @@ class LiveMap:
         self.points: dict[int, Float[np.ndarray, " 3"]] = {}
         self.keyframes: deque[Keyframe] = deque(maxlen=_KEYFRAMES)
         self.waiting: deque[Keyframe] = deque(maxlen=_WAIT)
+        self.least_parallax = _ROTATED
+        """px: median distance from a pure turn up to which two views begin no map."""
         self.T_WC = np.eye(4)
         self.step = np.eye(4)
         """The last motion, from camera to camera."""
@@ -86,11 +94,12 @@ class LiveMap:
         **Returns:** poses of all frames that were taken in, the newest last, `None` for
         those that do not fit; `None` as long as there is no map.
         """
-        now = Keyframe(np.eye(4), ids, self._normalised(uv))
-        self.waiting.append(now)
-        tried = sorted({0, len(self.waiting) // 2, 3 * len(self.waiting) // 4})
-        for k in tried:
-            if k < len(self.waiting) - 5 and self._two_views(self.waiting[k], now):
+        now = self.wait(ids, uv)
+        count = len(self.waiting)
+        tried = {0, count // 2, 3 * count // 4}
+        tried |= {count - lag for lag in _LAGS if count > 4 * lag}
+        for k in sorted(tried):
+            if k < count - 5 and self._two_views(self.waiting[k], now):
                 break
         else:
             return None
@@ -104,6 +113,14 @@ class LiveMap:
         self.step = np.eye(4)
         self.waiting.clear()
         return found
+
+    def wait(
+        self, ids: Int[np.ndarray, " n"], uv: Float[np.ndarray, "n 2"]
+    ) -> Keyframe:
+        """Takes a frame in as `begin` does, and tries nothing."""
+        now = Keyframe(np.eye(4), ids, self._normalised(uv))
+        self.waiting.append(now)
+        return now
 
     def locate(
         self, ids: Int[np.ndarray, " n"], uv: Float[np.ndarray, "n 2"]
@@ -172,7 +189,7 @@ class LiveMap:
         R, t, good = found
         turned = np.column_stack([xy_a, np.ones(len(xy_a))]) @ R.T
         away = np.linalg.norm(turned[:, :2] / turned[:, 2:] - xy_b, axis=1)
-        if np.median(away) < _ROTATED * pixel:
+        if np.median(away) < self.least_parallax * pixel:
             return False
         R_CW = np.stack([np.eye(3), R])
         centre = np.stack([np.zeros(3), -R.T @ t])
