@@ -190,6 +190,8 @@ class Maps:
         if self.number in self.record.fixed:
             now, since = rows[-1].time, rows[first].time
             line = f"the camera moved (at {now:.1f} s): a map begins at {since:.1f} s"
+            if self.intrinsics is not None and self.intrinsics.is_guess:
+                line += "; or it turned, and the guessed focal length is wrong"
             self.warnings[line] = None
         self.window.restart()
         self.follower.places.clear()
