@@ -97,8 +97,9 @@ class TurningCamera:
         points, seen = {}, {}
         for i, one in zip(ids.tolist(), towards, strict=True):
             count = self.seen.get(i, 0)
-            mean = self.points.get(i, one)
+            mean = self.points[i] if count else one
             if count < _SEEN:
-                mean = (count * mean + one) / np.linalg.norm(count * mean + one)
+                total = count * mean + one
+                mean = total / np.linalg.norm(total)
             points[i], seen[i] = mean, min(count + 1, _SEEN)
         self.points, self.seen = points, seen
