@@ -3,6 +3,7 @@
     python benchmarks/bench_online.py simulated M2 --family follow --frames 150
     python benchmarks/bench_online.py film FOLDER --frames 300 [--networks] [--every 3]
     python benchmarks/bench_online.py dropped FOLDER
+    python benchmarks/bench_online.py tripod E1 --camera still --frames 210
     python benchmarks/bench_online.py faults
     python benchmarks/bench_online.py memory --frames 3000
 
@@ -31,6 +32,7 @@ from bodyslam_jax import evaluation, io, simulation
 from bodyslam_jax.config import Simulation
 from bodyslam_jax.io.selection import select_frames
 from bodyslam_jax.online import Estimate, Online
+from bodyslam_jax.simulation.exact_scene import look_at
 from bodyslam_jax.types import Result, Sequence
 
 SURE = 0.1
@@ -45,6 +47,8 @@ FIGURES = {
 DARK = slice(60, 150)
 """Frames of 3 s without a picture."""
 NOBODY = slice(90, 150)
+STANDS = 5.0
+"""s after which the camera on a tripod moves."""
 TAKEN = (
     *(0, 2, 3, 4, 5, 6, 8, 10, 12, 15, 16, 19, 21, 23, 26, 28, 32, 35, 38, 41, 46, 48),
     *(51, 53, 55, 58, 68, 83, 86, 90, 92, 94, 97, 99, 101, 104, 106, 108, 111, 113),
@@ -76,6 +80,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=150)
     parser.add_argument("--people", type=int, default=1)
     parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--camera", choices=("still", "turn", "move"), default="still")
     parser.add_argument("--networks", action="store_true")
     parser.add_argument("--no-offline", action="store_true")
     given = parser.parse_args()
@@ -123,6 +128,30 @@ def dropped(given: Any) -> Iterator[dict]:
         online.update(row.image, row.timestamp, row.keypoints)
     truth = evaluation.read_groundtruth(folder / "groundtruth", online.body)
     yield from compared(online, [], truth, bare, False)
+
+
+def tripod(given: Any) -> Iterator[dict]:
+    """A walker in a room before a camera that stands still, turns half as far as the
+    person goes, or stands for 5 s and then moves sideways, up to 0.5 m/s."""
+    settings: Any = {"sequence": given.which, "length": given.frames}
+    made = simulation.simulate(Simulation(family="room", **settings))
+    T_WC, pelvis = made.T_WC, made.walk.pelvis
+    eye = np.tile(T_WC[:, :3, 3].mean(axis=0), (given.frames, 1))
+    aim = np.tile(pelvis.mean(axis=0), (given.frames, 1))
+    if given.camera == "turn":
+        aim = (aim + pelvis) / 2
+    if given.camera == "move":
+        since = np.maximum(made.timestamps - STANDS, 0.0)
+        way = np.where(since < 1, since**2 / 2, since - 0.5) / 2
+        eye = eye + np.outer(way, look_at(eye, aim)[0, :3, 0])
+    made = simulation.filmed_from(made, look_at(eye, aim))
+    sequence = dataclasses.replace(simulation.as_sequence(made), bodies=None)
+    online = prepared(sequence)
+    estimates, figures = play(online, frames_of(sequence))
+    case = f"{given.which} {given.camera}"
+    yield {"case": case, **figures, "states": states(estimates)}
+    truth = simulation.as_truth(made)
+    yield from compared(online, estimates, truth, sequence, not given.no_offline)
 
 
 class LatePool:
@@ -383,6 +412,7 @@ KINDS = {
     "simulated": simulated,
     "film": film,
     "dropped": dropped,
+    "tripod": tripod,
     "faults": faults,
     "memory": memory,
 }

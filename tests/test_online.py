@@ -22,8 +22,9 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.io.camera.calibration import project_points
 from bodyslam_jax.io.capture import Capture
-from bodyslam_jax.online import online as live
+from bodyslam_jax.online import maps
 from bodyslam_jax.online import prior as priors
+from bodyslam_jax.online.online import SMOOTHED
 from bodyslam_jax.online.record import smoothed_scales
 from bodyslam_jax.online.window import SCALE_WALK, Window
 from bodyslam_jax.online.window_content import FRAMES, Measured
@@ -433,7 +434,8 @@ def walk() -> tuple[Sequence, Result]:
 @pytest.mark.slow
 def test_the_estimate_of_a_simulated_walk(walk):
     sequence, truth = walk
-    online = bs.Online(intrinsics=sequence.intrinsics, fps=30.0, threads=False)
+    given = {"intrinsics": sequence.intrinsics, "fps": 30.0}
+    online = bs.Online(**given, threads=False, smooth=True)
     estimates = list(play(online, sequence, range(150), twice=(100,)))
     assert len(estimates) == 151
     late = [e for e in estimates if e.status == "late"]
@@ -456,6 +458,12 @@ def test_the_estimate_of_a_simulated_walk(walk):
     assert "1 frames came late" in " ".join(result.summary["warnings"])
     with pytest.raises(InputError, match="finished"):
         online.update(None, 99.0)
+    smooth = online.smooth()
+    assert any(SMOOTHED in line for line in smooth.summary["warnings"])
+    assert len(smooth.timestamps) == 150
+    last = evaluation.evaluate(smooth, truth, online.body)
+    assert float(last["c_ate_se3"]) < 0.03
+    assert float(last["j_ate_se3"]) < float(found["j_ate_se3"])
 
 
 @pytest.mark.slow
@@ -563,7 +571,7 @@ def test_a_late_window_takes_all_in_and_compiles_nothing(long_walk):
 @pytest.mark.slow
 def test_a_window_that_is_too_late_goes_on_at_the_newest_frames(walk, monkeypatch):
     sequence, truth = walk
-    monkeypatch.setattr(live, "_MAX_WAITING_FRAMES", 2 * CHUNK)
+    monkeypatch.setattr(maps, "_MAX_WAITING_FRAMES", 2 * CHUNK)
     online, pool = late(sequence, 3.0)
     play_late(online, pool, sequence)
     assert max(pool.taken) <= 2 * CHUNK

@@ -33,6 +33,7 @@ def live(
     page: bool = True,
     port: int = 0,
     open: bool = False,
+    smooth: bool = False,
     preset: Preset = "default",
     settings: Path | None = None,
     config: Flat = Config(),
@@ -51,11 +52,14 @@ def live(
         page: Whether a page is served; without it, progress is told in lines.
         port: Port of the page; 0 takes a free one.
         open: Open the page in the default browser.
+        smooth: After the end estimate everything once more, offline, from the points
+            and keypoints that were recorded; it takes as long as `run` without its
+            images.
         preset: `paper` selects the paper's weights and motion network.
         settings: Settings file (config.yaml); it overrides the preset, and options
             override both.
         config: Settings of every stage; what is known of a whole video (--start,
-            --end, --height, --camera-path, --static-camera, --person) is refused.
+            --end, --height, --camera-path, --person) is refused.
     """
     from bodyslam_jax import export
     from bodyslam_jax.cli.folders import free_folder
@@ -71,7 +75,13 @@ def live(
         name = _name(source)
         out = out or free_folder(name)
         export.check_folder(out, {"name": name}, None)
-        online = Online(config, intrinsics=intrinsics, fps=capture.fps, name=name)
+        online = Online(
+            config,
+            intrinsics=intrinsics,
+            fps=capture.fps,
+            name=name,
+            smooth=smooth,
+        )
         log.info("live: %s at %.3g frames a second -> %s", source, capture.fps, out)
         width, height = capture.size
         with compiling("live", f"{width}x{height} px"):
@@ -94,8 +104,25 @@ def live(
         online.video, online.picks = capture.path, indices
     with unexpected.noted_in(out):
         result = online.finish()
+        if smooth:
+            result = _smoothed(online, result)
         _write_folder(online, result, out)
     return finish(result, out)
+
+
+def _smoothed(online: Any, result: Any) -> Any:
+    """Returns the result of a last offline pass; if that fails, `result` with a warning
+    that says why."""
+    from bodyslam_jax.config.errors import InputError
+
+    log.info("live: a last offline pass over %d frames", len(result.timestamps))
+    try:
+        return online.smooth()
+    except InputError as error:
+        line = f"no last offline pass, so this is the estimate of the live run: {error}"
+        result.summary["warnings"].append(line)
+        log.warning(line)
+        return result
 
 
 def _write_folder(online: Any, result: Any, out: Path) -> None:
@@ -126,7 +153,7 @@ def _check(config: Config) -> None:
     """
     from bodyslam_jax.config.errors import InputError
 
-    for name in ("start", "end", "camera_path", "static_camera", "person", "height"):
+    for name in ("start", "end", "camera_path", "person", "height"):
         if getattr(config, name) not in (None, False, ()):
             option = "--" + name.replace("_", "-")
             raise InputError(f"{option}: `live` does not use it; use `bodyslam run`.")

@@ -56,13 +56,15 @@ class Estimate:
     located: bool
     people: tuple[PersonEstimate, ...]
     scale: float
-    """m per map unit; NaN as long as it is unknown."""
+    """m per map unit; NaN as long as it is unknown, 1 where `status` is `fixed`."""
     scale_sigma: float
-    """Standard deviation of `scale`, m per map unit; NaN as long as it is unknown."""
+    """Standard deviation of `scale`, m per map unit; NaN as long as it is unknown.
+    Where `status` is `fixed`, the relative one of people's sizes."""
     status: str
-    """`starting`: no map yet; `tracking`; `lost`: the camera cannot be located in
-    the map; `late`: the frame was not used, as its time is not after that of the
-    last one."""
+    """`starting`: no map yet; `tracking`; `fixed`: the camera stands still or only
+    turns, and the scale is determined by people's sizes alone; `lost`: the camera
+    cannot be located in the map; `late`: the frame was not used, as its time is not
+    after that of the last one."""
     notes: tuple[str, ...]
     """Warnings about the estimate, one line each."""
     latency: float
@@ -93,6 +95,12 @@ class World:
     number."""
     height: float | None = None
     """Height of the first camera over the floor, m."""
+
+    def next_map(self) -> None:
+        """Continues this world in a new map whose first camera has the same pose in it;
+        the unit of the map, and with it the scale, is another one."""
+        sums = np.array(list(self.inside.values())).reshape(-1, 3)
+        self.trunks, self.inside = self.trunks + sums.sum(axis=0), {}
 
     def camera(self, T_WC: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
         """Returns the pose of a camera of the map in the metric world."""

@@ -42,6 +42,9 @@ def compile_all(
     scratch.advance(frames[: FRAMES - CHUNK])
     scratch.advance(frames[FRAMES - CHUNK :])
     solver.marginals(scratch.problem, scratch.state)
+    scratch.restart()
+    scratch.fixed = True
+    scratch.advance(frames[: 2 * CHUNK])
     one = PersonFilter(intrinsics, body, fps, config.people_fit)
     one.update(0.0, points, np.zeros(10))
     one.update(1 / fps, points, np.zeros(10))

@@ -1,9 +1,9 @@
 """The record of a running video, and the result that is made of it at the end.
 
-For every frame it keeps the time, the pose relative to a frame of the window, and
-people's keypoints; for the frames of the window, as they leave it: camera, roots and
-postures. No image is kept. It takes half a kilobyte a frame, and one more for each
-person.
+For every frame it keeps the time, the pose relative to a frame of the window, people's
+keypoints and, for a last offline pass, the points (2.5 kB); for the frames of the
+window, as they leave it: camera, roots and postures. No image is kept. Without points
+it takes half a kilobyte a frame, and one more for each person.
 """
 
 import dataclasses
@@ -43,6 +43,8 @@ class Seen:
     """Transform from its camera to that of the window's frame, map units."""
     located: bool
     people: dict[int, Float[np.ndarray, "25 3"]]
+    points: tuple[np.ndarray, np.ndarray] | None = None
+    """Numbers and positions (px) of points of the scene, if they are kept."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,6 +102,14 @@ class Record:
         self.landmarks: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
         """By map and track: a frame that observed it, and its position, map units."""
         self.shapes: dict[int, np.ndarray] = {}
+        self.shape_covariances: dict[int, np.ndarray] = {}
+        self.fixed: dict[int, str] = {}
+        """Motion of the camera, `static` or `rotation`, by map; only of maps whose
+        camera is fixed."""
+        self.joins: dict[int, tuple[tuple[int, int], np.ndarray]] = {}
+        """By map that continues another one, whose camera began to move: map and slot
+        of a frame of the other one, and the pose of the first camera relative to that
+        frame's, m."""
         self.pixel_sigma = 0.7
 
     def keep(self, number: int, solved: Solved) -> None:
@@ -126,11 +136,41 @@ class Record:
         for h, person in enumerate(solved.people):
             if person is not None and solved.present[h].any():
                 self.shapes[person] = solved.shapes[h]
-        told = first + len(solved.times) - 1, solved.scale, solved.scale_sigma
+                self.shape_covariances[person] = solved.shape_covariance[h]
+        sigma = float("nan") if solved.fixed else solved.scale_sigma
+        told = first + len(solved.times) - 1, solved.scale, sigma
         self.scales.setdefault(number, []).append(told)
         for track, place in solved.landmarks.items():
             if len(self.landmarks) < _MAX_LANDMARKS:
                 self.landmarks[number, track] = told[0], place.copy()
+
+    def join(self, number: int, frames: int) -> None:
+        """Removes the last so many frames from the map that has them and ends it there,
+        so that map `number` can begin with them."""
+        first = self.frames[len(self.frames) - frames]
+        del self.frames[len(self.frames) - frames :]
+        self.joins[number] = (first.map, first.slot), first.since
+        # The next slot is kept, as frames lie between two.
+        for of, slot in list(self.slots):
+            if of == first.map and slot > first.slot + 1:
+                del self.slots[of, slot]
+
+    def measured(
+        self, intrinsics: Intrinsics, name: str, warnings: tuple[str, ...]
+    ) -> Sequence:
+        """Returns all recorded measurements as the input of an offline run: the
+        keypoints of everybody who was seen, and the points if they were kept."""
+        persons = sorted({person for frame in self.frames for person in frame.people})
+        times = np.array([frame.time for frame in self.frames])
+        return Sequence(
+            name=name,
+            frames=None,
+            timestamps=times - times[0],
+            intrinsics=intrinsics,
+            keypoints=_keypoints(self, persons),
+            tracks=_tracks(self),
+            warnings=warnings,
+        )
 
     def pass_over(self, number: int, slot: int, measured: Measured) -> None:
         """Keeps the camera of a frame that is not passed to the window."""
@@ -179,7 +219,8 @@ def parts_of(
     """Returns all frames as the stages of an offline run pass them on: measurements,
     cameras, and the joint estimate; `fps` is the rate of the window's frames."""
     path = _path(record, fps)
-    told = record.scales[max(record.scales)] if record.scales else []
+    moving = [number for number in record.scales if number not in record.fixed]
+    told = record.scales[max(moving)] if moving else []
     _, scales, sigma = smoothed_scales(told, fps)
     scale = float(scales[-1])
     T_WC, located = _cameras(record, path)
@@ -204,7 +245,7 @@ def parts_of(
     )
     none = np.zeros(0, int)
     sfm = SfmResult(
-        kind="moving" if record.scales else "static",
+        kind="moving" if moving else _kind_of_fixed(record),
         T_WC=cameras,
         registered=located,
         landmarks=landmarks / scale,
@@ -224,8 +265,10 @@ def parts_of(
     joint = JointEstimate(
         scale=scale,
         start=start,
-        scale_sigma=sigma if np.isfinite(sigma) else float("inf"),
-        shape_covariance=np.full((len(persons), 10, 10), np.nan),
+        scale_sigma=sigma if np.isfinite(sigma) or not moving else float("inf"),
+        shape_covariance=np.array(
+            [record.shape_covariances[p] for p in persons]
+        ).reshape(-1, 10, 10),
         unobserved=(),
         cameras=cameras,
         roots=roots,
@@ -239,6 +282,12 @@ def parts_of(
         contacts=contacts,
     )
     return measured, sfm, joint
+
+
+def _kind_of_fixed(record: Record) -> str:
+    """Returns the motion of a camera that began no map: `rotation` if it ever turned,
+    else `static`."""
+    return "rotation" if "rotation" in record.fixed.values() else "static"
 
 
 def _path(record: Record, fps: float) -> _Path:
@@ -261,7 +310,9 @@ def _path(record: Record, fps: float) -> _Path:
         T[:, :3, 3] = T[0, :3, 3] * s[0] + np.concatenate(
             [np.zeros((1, 3)), np.cumsum(steps, axis=0)]
         )
-        into = end @ np.linalg.inv(T[0])
+        before, since = record.joins.get(number, ((number, 0), np.eye(4)))
+        start = poses[before] @ since if before in poses else end
+        into = start @ np.linalg.inv(T[0])
         for k, pose, value in zip(slots, T, s, strict=True):
             poses[number, k] = into @ pose
             scale_at[number, k] = float(value)
@@ -307,6 +358,21 @@ def _keypoints(record: Record, persons: list[int]) -> Keypoints | None:
         for h, person in enumerate(persons):
             found[h, t] = frame.people.get(person, 0.0)
     return Keypoints(found[..., :2], found[..., 2])
+
+
+def _tracks(record: Record) -> Tracks | None:
+    """Returns the recorded points as tracks; `None` if none were kept."""
+    kept = [
+        (k, *frame.points)
+        for k, frame in enumerate(record.frames)
+        if frame.points is not None
+    ]
+    if not kept:
+        return None
+    frame = np.concatenate([np.full(len(ids), k) for k, ids, _ in kept])
+    number = np.concatenate([ids for _, ids, _ in kept])
+    uv = np.concatenate([pixels for _, _, pixels in kept]).astype(float)
+    return Tracks(frame, np.unique(number, return_inverse=True)[1].reshape(-1), uv)
 
 
 def _people(

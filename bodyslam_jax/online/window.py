@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax import graph, initialisation, solver
 from bodyslam_jax.diagnostics.scale_uncertainty import inflate_fitted_shapes
+from bodyslam_jax.diagnostics.statistics import stature_and_sigma
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.motion import leg_length
@@ -51,6 +52,8 @@ class Solved:
     """T_CH, m."""
     poses: Float[np.ndarray, "h t 23 3"]
     shapes: Float[np.ndarray, "h 10"]
+    shape_covariance: Float[np.ndarray, "h 10 10"]
+    """Covariance of each shape; NaN where it was not computed."""
     scale: float
     """m per map unit."""
     scale_sigma: float
@@ -62,6 +65,9 @@ class Solved:
     the ground."""
     seconds: dict[str, float]
     """Duration of each part of this step, s."""
+    fixed: bool = False
+    """True if the camera was held: `scale` is 1 then, and `scale_sigma` the relative
+    standard deviation of people's sizes."""
 
 
 class Window(Content):
@@ -99,12 +105,12 @@ class Window(Content):
         """Resumes after a gap of so many frames, in the same map: cameras, landmarks
         and postures of the gap are unknown, people and s are kept."""
         self.prior = None
-        people = list(self.people)
+        people, fixed = list(self.people), self.fixed
         told = self.steps_told, self.ground_told, self.pixel_sigma
         at = self.first + self.count + frames
         scale, variance = self.scale, self.scale_sigma**2
         self.restart()
-        self.people = people
+        self.people, self.fixed = people, fixed
         self.steps_told, self.ground_told, self.pixel_sigma = told
         self.shapes = np.array([self._known_shape(p) for p in self.people])
         self.began[:] = -1
@@ -118,7 +124,7 @@ class Window(Content):
         clock("start")
         problem, state, told = window_problem.make(self, sequence, state, roots)
         clock("factors")
-        first = np.isnan(self.scale_sigma)
+        first = np.isnan(self.size_sigma if self.fixed else self.scale_sigma)
         steps = _NUM_FIRST_STEPS if first else _NUM_STEPS
         stage = solver.Stage(max_steps=steps, rtol=1e-4, atol=0.01)
         solution = solver.solve(problem, state, schedule=(stage,))
@@ -136,26 +142,31 @@ class Window(Content):
     def _measure(
         self, problem: graph.Problem, state: graph.State, metric: bool
     ) -> None:
-        """Updates the standard deviation of s from the window's posterior."""
-        if not metric:
+        """Updates the standard deviations of s and of people's sizes from the window's
+        posterior."""
+        present = np.array([p is not None for p in self.people])
+        seen = present & np.asarray(problem.free.shapes).any(axis=1)
+        if not (metric or (self.fixed and seen.any())):
             return
         spread = solver.marginals(problem, state)
-        present = np.array([p is not None for p in self.people])
-        variance = float(spread.scale)
+        variance, shapes = spread.scale, spread.shapes
         if present.any():
             sigma = np.where(present, self.config.weights.shape_sigma, 1.0)
-            variance = float(
-                inflate_fitted_shapes(
-                    spread.scale,
-                    spread.shapes,
-                    state.scale,
-                    state.shapes,
-                    self.body,
-                    sigma,
-                    present,
-                )[0]
-            )
-        self.scale_sigma = variance**0.5
+            of_state = state.scale, state.shapes, self.body
+            given = variance, shapes, *of_state, sigma, present
+            variance, shapes = inflate_fitted_shapes(*given)
+        self.shape_covariance[seen] = np.asarray(shapes)[seen]
+        if not self.fixed:
+            self.scale_sigma = float(variance) ** 0.5
+            return
+        betas = np.asarray(state.shapes, float)
+        relative = []
+        for h in np.flatnonzero(seen):
+            given = self.body, betas[h], self.shape_covariance[h]
+            stature, sigma = stature_and_sigma(*given)
+            relative.append(sigma / stature)
+        # The errors of people's sizes are independent.
+        self.size_sigma = float(np.linalg.norm(relative)) / len(relative)
 
     def _contacts(
         self, state: graph.State, roots: PersonState
@@ -177,7 +188,8 @@ class Window(Content):
         self.roots, self.poses = np.array(state.roots), np.array(state.poses)
         self.known |= present & (np.arange(FRAMES) < CHUNK + self.count)
         self.shapes = np.array(state.shapes)
-        self.scale = float(state.scale)
+        # Before a camera that is held s is the height of the floor in this window.
+        self.scale = 1.0 if self.fixed else float(state.scale)
         for i, place in zip(self.in_graph.tolist(), np.asarray(state.landmarks)):
             self.where[i] = place
         tracks = problem.factors[0]
@@ -217,7 +229,7 @@ class Window(Content):
         prior = left.problem.factors[-1]
         assert isinstance(prior, graph.MarginalPrior)
         prior = priors.padded(prior, left.state, PRIOR)
-        walk = self.scale * SCALE_WALK
+        walk = np.inf if self.fixed else self.scale * SCALE_WALK
         self.prior = priors.with_walk_of_scale(prior, walk**2 * CHUNK / self.fps)
         if self.told.size:
             self.steps_told += self.told[:, CHUNK : 2 * CHUNK].sum(axis=1)
@@ -242,8 +254,9 @@ class Window(Content):
             roots=self.roots[:, shown].copy(),
             poses=self.poses[:, shown].copy(),
             shapes=self.shapes.copy(),
+            shape_covariance=self.shape_covariance.copy(),
             scale=self.scale,
-            scale_sigma=self.scale_sigma,
+            scale_sigma=self.size_sigma if self.fixed else self.scale_sigma,
             landmarks={
                 self.track[i]: self.where[i]
                 for i in self.in_graph.tolist()
@@ -251,6 +264,7 @@ class Window(Content):
             },
             contacts=contacts[:, shown],
             seconds=seconds,
+            fixed=self.fixed,
         )
 
 

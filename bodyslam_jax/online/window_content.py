@@ -92,12 +92,20 @@ class Content:
         self.known = np.zeros((places, FRAMES), bool)
         """True where roots and poses are those of a solve."""
         self.shapes = np.zeros((places, 10))
+        self.shape_covariance = np.full((places, 10, 10), np.nan)
+        """Covariance of each shape from the last solve that computed it, else NaN."""
         self.people: list[int | None] = [None] * places
         self.began = np.zeros(places, int)
         """Number of the frame in which each person's shape is measured."""
         self.book: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         """Shapes, and their standard deviations, of people who have left the window."""
+        self.fixed = False
+        """True if the camera stands still or only turns: its poses are held, there are
+        no landmarks, and the scale is determined by people's sizes alone."""
         self.scale, self.scale_sigma = 1.0, float("nan")
+        self.size_sigma = float("nan")
+        """Relative standard deviation of people's sizes where `fixed`; NaN as long as
+        it is unknown."""
         self.pixel_sigma = _INITIAL_SIGMA_PX
         self.steps_told = np.zeros(places)
         """Information of marginalised steps on their common factor."""
@@ -139,8 +147,9 @@ class Content:
         for k, frame in enumerate(frames, start=at):
             self.cameras[k:] = frame.T_WC
             self.located[k] = frame.located
-            self.free[k] = float(frame.located and len(frame.ids) > 0)
-            self.seen[k] = self._landmarks_of(k, frame) if frame.located else _NOTHING
+            shown = frame.located and len(frame.ids) > 0 and not self.fixed
+            self.free[k] = float(shown)
+            self.seen[k] = self._landmarks_of(k, frame) if shown else _NOTHING
             self.known[:, k:] = False
             self.uv[:, k:], self.confidence[:, k:] = 0.0, 0.0
             for person, points in frame.people.items():
@@ -207,6 +216,7 @@ class Content:
         self.uv[h], self.confidence[h] = 0.0, 0.0
         self.roots[h], self.poses[h] = np.eye(4), 0.0
         self.shapes[h] = self._known_shape(person)
+        self.shape_covariance[h] = np.nan
         return h
 
     def _known_shape(self, person: int | None) -> Float[np.ndarray, " 10"]:

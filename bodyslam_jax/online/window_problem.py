@@ -24,9 +24,11 @@ from bodyslam_jax.online.window_content import FRAMES, PRIOR, Content
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.pipeline.motion_prediction import (
     contact_predictor,
+    contact_probability,
     motion_predictor,
     predict,
 )
+from bodyslam_jax.pipeline.people_floor import View, on_floor
 from bodyslam_jax.solver.subproblem import in_frames
 from bodyslam_jax.types import Keypoints, ScaleStart, Sequence, Tracks
 
@@ -46,6 +48,10 @@ _GROUND_HALF_INFORMATION_FRAMES = 10.0
 _DEFINITION = "unknown"
 """The detector's definition of hip and knee (`Keypoints.definition`)."""
 _UNKNOWN_POSITION = np.full(3, np.nan)
+_PLACEHOLDER_SIGMA_PX = 1e6
+"""Standard deviation of the observation of a placeholder landmark, px. A window without
+landmarks has one, so that its tables, and with them its programs, are those of others.
+"""
 _MAX_LANDMARKS = 540
 """Number of landmarks that the tables of a window hold; they are partly filled."""
 _VARIABLES = ("scale", "cameras", "roots", "poses", "shapes", "landmarks")
@@ -111,11 +117,17 @@ def make(
     weights = window.config.weights
     measured = np.arange(FRAMES) >= CHUNK
     tracks, places = _tracks(window)
+    shown = len(places) > 0
+    if not shown:
+        tracks, places = _placeholder(window)
     state = eqx.tree_at(lambda s: s.landmarks, state, put(places))
     sigma = initialisation.landmark_sigma(window.pixel_sigma, weights)
     cameras = initialisation.map_factor(
         tracks, np.ones(len(tracks.frame), bool), sigma, weights
     )
+    if not shown:
+        none = jnp.full_like(cameras.sigma, _PLACEHOLDER_SIGMA_PX)
+        cameras = eqx.tree_at(lambda f: f.sigma, cameras, none)
     of_people = [
         _shape_once(window, f, roots) if isinstance(f, graph.ShapePrior) else f
         for f in initialisation.people_factors(sequence, roots, weights, window.body)
@@ -144,6 +156,8 @@ def make(
         nothing = priors.no_prior(state, PRIOR, 2)
         window.prior = priors.with_scale(nothing, window.scale_sigma)
     metric = np.isfinite(window.scale_sigma) or bool((told > 0).any())
+    if window.fixed:  # s is proportional to the floor's height.
+        metric = bool(np.isfinite(np.asarray(ground.sigma)).any())
     free = dataclasses.replace(state, landmarks=put(places[:0])).zero_step()
     ones = lambda x, mask: jnp.ones_like(x) * jnp.asarray(mask, x.dtype)
     past = np.asarray(np.arange(FRAMES) >= CHUNK - window.prior.reach)
@@ -157,7 +171,7 @@ def make(
         roots=ones(free.roots, (there & past)[..., None]),
         poses=ones(free.poses, (there & last)[..., None, None]),
         shapes=ones(free.shapes, np.asarray(there.any(axis=1))[:, None]),
-        landmarks=put(np.ones(places.shape)),
+        landmarks=put(np.full(places.shape, float(shown))),
     )
     problem = graph.make_problem(
         [*factors, window.prior],
@@ -171,7 +185,7 @@ def make(
     problem = dataclasses.replace(problem, variables=variables)
     if problem.layout.num_chunks != FRAMES // CHUNK:
         log.warning("a window's landmarks fit in no table of its size")
-    return problem, state, told if metric else told[:0]
+    return problem, state, told if metric and not window.fixed else told[:0]
 
 
 def _tracks(
@@ -211,6 +225,15 @@ def _tracks(
     number = np.cumsum(good) - 1
     window.in_graph = known[good]
     return Tracks(frame[rows], number[row[rows]], uv[rows]), places[good]
+
+
+def _placeholder(window: Content) -> tuple[Tracks, Float[np.ndarray, "1 3"]]:
+    """Returns the observation of a placeholder landmark in the first measured frame,
+    and its position, one map unit ahead of that camera."""
+    T_WC = window.cameras[CHUNK]
+    middle = np.asarray(window.intrinsics.params[2:4], float)
+    seen = np.array([CHUNK]), np.array([0]), middle[None]
+    return Tracks(*seen), (T_WC[:3, 3] + T_WC[:3, 2])[None]
 
 
 def _shape_once(
@@ -280,6 +303,8 @@ def _ground(
         jnp.full((window.places, FRAMES), jnp.inf),
     )
     present = roots.present & window.located & legs & measured
+    if window.fixed:
+        return _floor(window, sequence, state, present) or blank, state
     contact = None
     if present.sum() >= CHUNK:
         contact = initialisation.ground_contact(
@@ -306,6 +331,23 @@ def _ground(
     # `sigma` is that of all frames together times the root of their number.
     sigma = sigma / np.sqrt(count) * np.sqrt(count / grown)
     return eqx.tree_at(lambda f: f.sigma, contact, jnp.asarray(sigma)), state
+
+
+def _floor(
+    window: Content, sequence: Sequence, state: graph.State, present: np.ndarray
+) -> graph.GroundContact | None:
+    """Returns the factor of people on one floor before a fixed camera, as offline: its
+    height is determined by their sizes alone. `None` without feet in contact."""
+    weights = window.config.weights
+    if weights.ground_sigma is None or not present.any():
+        return None
+    probability = None
+    if window.stands is not None:
+        stands = dataclasses.replace(window.stands, present=jnp.asarray(present))
+        probability = contact_probability(stands, state, window.fps)
+    fitted = np.ones(window.places, bool)
+    seen = present, sequence.keypoints, fitted, window.fps, window.config.gravity
+    return on_floor(state, probability, View(*seen), window.body, weights)
 
 
 def _most(good: np.ndarray, seen: np.ndarray, most: int) -> np.ndarray:

@@ -32,6 +32,9 @@ _MIN_FIRST_INLIER_SHARE = 0.7
 """Least share of inliers of two views that begin a map."""
 _MAX_WAITING_FRAMES = 240
 """Number of frames that are kept until two views begin a map."""
+_LAGS_FRAMES = (15, 30, 60)
+"""Ages of further frames with which a map may begin, as few points are tracked for
+longer; each is tried once more than four times as many frames wait."""
 _KEYFRAME_INTERVAL, _MIN_COMMON_SHARE = 5, 0.7
 """Largest number of frames between keyframes; share of the last keyframe's points below
 which there is a new one."""
@@ -46,6 +49,9 @@ _MAX_OUTLIER_SHARE = 0.25
 """Largest share of outliers among the views of a new point: tracks have outliers."""
 _MAX_ROTATION_ERROR_PX = 2.0
 """Largest median distance from a pure rotation of two views without parallax, px."""
+MAX_FIXED_ROTATION_ERROR_PX = 6.0
+"""The same limit where the camera was fixed before, px: noise of tracks and a wrong
+focal length together stay below it, as offline (`sfm`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +74,9 @@ class LiveMap:
         self.points: dict[int, Float[np.ndarray, " 3"]] = {}
         self.keyframes: deque[Keyframe] = deque(maxlen=_NUM_KEYFRAMES)
         self.waiting: deque[Keyframe] = deque(maxlen=_MAX_WAITING_FRAMES)
+        self.max_rotation_error = _MAX_ROTATION_ERROR_PX
+        """Largest median distance from a pure rotation of two views that begin no map,
+        px."""
         self.T_WC = np.eye(4)
         self.step = np.eye(4)
         """The last motion, from camera to camera."""
@@ -86,11 +95,12 @@ class LiveMap:
         **Returns:** poses of all frames that were taken in, the newest last, `None` for
         those that do not fit; `None` as long as there is no map.
         """
-        now = Keyframe(np.eye(4), ids, self._normalised(uv))
-        self.waiting.append(now)
-        tried = sorted({0, len(self.waiting) // 2, 3 * len(self.waiting) // 4})
-        for k in tried:
-            if k < len(self.waiting) - 5 and self._two_views(self.waiting[k], now):
+        now = self.wait(ids, uv)
+        count = len(self.waiting)
+        tried = {0, count // 2, 3 * count // 4}
+        tried |= {count - lag for lag in _LAGS_FRAMES if count > 4 * lag}
+        for k in sorted(tried):
+            if k < count - 5 and self._two_views(self.waiting[k], now):
                 break
         else:
             return None
@@ -104,6 +114,14 @@ class LiveMap:
         self.step = np.eye(4)
         self.waiting.clear()
         return found
+
+    def wait(
+        self, ids: Int[np.ndarray, " n"], uv: Float[np.ndarray, "n 2"]
+    ) -> Keyframe:
+        """Adds a frame without trying to begin a map, and returns it."""
+        now = Keyframe(np.eye(4), ids, self._normalised(uv))
+        self.waiting.append(now)
+        return now
 
     def locate(
         self, ids: Int[np.ndarray, " n"], uv: Float[np.ndarray, "n 2"]
@@ -176,7 +194,7 @@ class LiveMap:
         R, t, good = found
         turned = np.column_stack([xy_a, np.ones(len(xy_a))]) @ R.T
         away = np.linalg.norm(turned[:, :2] / turned[:, 2:] - xy_b, axis=1)
-        if np.median(away) < _MAX_ROTATION_ERROR_PX * pixel:
+        if np.median(away) < self.max_rotation_error * pixel:
             return False
         R_CW = np.stack([np.eye(3), R])
         centre = np.stack([np.zeros(3), -R.T @ t])

@@ -33,7 +33,7 @@ Kind = Literal["moving", "rotation", "static", "failed"]
 
 _KEYFRAME_MOTION_SHARE = 0.03
 """Motion of points between keyframes, as a share of the image's longer side."""
-_MAX_STATIC_MOTION_PX = 0.6
+MAX_STATIC_MOTION_PX = 0.6
 """Motion of points below which the camera is static, px: assumes that medians over
 10 frames of tracks with 0.5 px noise at 640x480 drift by less; not scaled with the
 image."""
@@ -136,7 +136,7 @@ def reconstruct(
             text = "one frame shows no motion."
         return _nothing(problem, "failed", (*warnings, text))
     still = stillness(shot) * focal
-    if still < _MAX_STATIC_MOTION_PX:
+    if still < MAX_STATIC_MOTION_PX:
         text = f"the camera stands still (points wander {still:.2f} px)."
         return _fixed(problem, within, "static", None, (*warnings, text))
     motion = _KEYFRAME_MOTION_SHARE * max(intrinsics.width, intrinsics.height) / focal

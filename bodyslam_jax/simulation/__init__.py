@@ -12,6 +12,7 @@ from bodyslam_jax.simulation.sequences import LENGTH as LENGTH
 from bodyslam_jax.simulation.sequences import SimulatedSequence as SimulatedSequence
 from bodyslam_jax.simulation.sequences import as_sequence as as_sequence
 from bodyslam_jax.simulation.sequences import as_truth as as_truth
+from bodyslam_jax.simulation.sequences import filmed_from as filmed_from
 from bodyslam_jax.simulation.sequences import motion_file as motion_file
 from bodyslam_jax.simulation.sequences import simulate as simulate
 from bodyslam_jax.simulation.writing import check_folder as check_folder

@@ -340,6 +340,19 @@ def measure(
     )
 
 
+def filmed_from(
+    simulated: SimulatedSequence, T_WC: Float[np.ndarray, "t 4 4"]
+) -> SimulatedSequence:
+    """Simulates new measurements of the same people and room by other cameras, such as
+    one that stands still, with the noise and the seed of the sequence."""
+    _, *streams = np.random.default_rng(simulated.seed).spawn(4)
+    key, reg, pts = streams
+    first, *others = simulated.actors
+    given = simulated.settings, simulated.name, first.person, first.walk, T_WC
+    walks = [(actor.person, actor.walk) for actor in others]
+    return measure(*given, simulated.room, (key, reg, pts), walks)
+
+
 def as_sequence(simulated: SimulatedSequence) -> Sequence:
     """Returns the measurements as the readers would return them, without a video."""
     actors, t = simulated.actors, simulated.num_frames
