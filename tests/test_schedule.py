@@ -29,7 +29,8 @@ def test_a_run_takes_the_steps_of_its_preset(monkeypatch, config, steps):
     problem = graph.make_problem((), state)
     calls = []
 
-    def solve(problem, state, *, solver, schedule):
+    def solve(problem, state, *, solver, schedule, mixed_precision):
+        assert mixed_precision is False
         calls.append((solver, [stage.max_steps for stage in schedule]))
         cost, counts = jnp.asarray(1.0), (jnp.array(3), jnp.array(4))
         return Solution(state, optx.RESULTS.successful, cost, (), counts, 2 * cost)
