@@ -178,7 +178,7 @@ def test_last_steps_know_what_keypoints_bend():
             damping=damping,
         ).state
     )
-    best = run(run(run(start, 64), 64), 64)
+    best = run(run(start, 100), 100)
     rng = np.random.default_rng(0)
     move = 1e-3 * problem.free.poses * jnp.asarray(rng.standard_normal((1, 12, 23, 3)))
     near = best.retract(dataclasses.replace(best.zero_step(), poses=move))
