@@ -115,11 +115,34 @@ def test_on_a_hill_up_stays_where_trunks_point():
 @pytest.mark.parametrize("direction", [0.0, 0.8, 1.6, 2.4])
 def test_the_error_that_is_claimed_holds_on_a_slope(direction, fitted):
     """Up is taken to be nearly normal to a floor that slopes by 4 degrees, as most
-    floors are level; what is claimed allows for that."""
+    floors are level; what is claimed for floors that slope allows for that."""
     slope = np.tan(np.radians(4.0)) * np.array([np.cos(direction), np.sin(direction)])
     feet = walker(way(), floor=lambda x, z: slope[0] * x + slope[1] * z)
     found = find_upright(*cues(feet, (0.0, 0, 0), fitted=fitted))
-    assert 1.0 < off(found.up) < 1.15 * np.degrees(found.sigma)
+    assert 1.0 < off(found.up) < 1.15 * np.degrees(found.sigma_if_sloping)
+    assert found.sigma < found.sigma_if_sloping
+
+
+def test_up_is_claimed_as_a_mixture_of_level_and_sloping_floors():
+    """Half of the floors are level, a quarter nearly, and a quarter slope; trunks lean
+    as those of bodies that were fitted to keypoints."""
+    rng = np.random.default_rng(0)
+    error, sigma, steep, sloping = np.zeros((4, 200))
+    kinds = rng.choice([0.2, 0.7, 4.0], p=[0.5, 0.25, 0.25], size=200)
+    for k, kind in enumerate(kinds):
+        slope = np.tan(np.radians(kind * rng.standard_normal(2)))
+        feet = walker(way(120), floor=lambda x, z: slope[0] * x + slope[1] * z)
+        lean = rng.standard_normal(3) * [4.5, 0.0, 2.0]
+        found = find_upright(*cues(feet, lean))
+        error[k], sigma[k] = off(found.up) / 2**0.5, np.degrees(found.sigma)
+        steep[k], sloping[k] = found.sigma_if_sloping, found.slope_probability
+    rms = lambda x: np.sqrt(np.mean(x**2))
+    # σ is that of the less certain axis.
+    assert 0.5 < rms(error / sigma) < 1.1
+    slopes = kinds == 4.0
+    assert rms(error[slopes]) > 2 * rms(error[~slopes])
+    assert 0.5 < rms(error[slopes] / np.degrees(steep[slopes])) < 1.1
+    assert sloping[slopes].mean() > 1.2 * sloping[~slopes].mean()
 
 
 def test_a_floor_of_steps_says_less_of_gravity_than_a_level_one():

@@ -200,16 +200,20 @@ def _lengths(found: Accuracy) -> dict[str, float | None]:
 
 
 def _up(up: Upright, found: Accuracy) -> dict[str, float | None]:
-    """Returns the uncertainty of the vertical, its angles to trunks and edges, and the
-    slope of the ground."""
+    """Returns the uncertainty of the vertical, over all kinds of ground and on ground
+    that slopes, its angles to trunks and edges, and the slope of the ground."""
     angles = {
         "sigma_degrees": found.up,
+        "sigma_if_sloping_degrees": up.sigma_if_sloping,
         "from_trunks_degrees": up.trunks,
         "from_edges_degrees": up.edges,
         "slope_of_ground_degrees": up.ground,
     }
     degrees = lambda x: float(np.degrees(x)) if np.isfinite(x) else None
-    return {name: degrees(angle) for name, angle in angles.items()}
+    found_by_name = {name: degrees(angle) for name, angle in angles.items()}
+    known = np.isfinite(up.slope_probability)
+    found_by_name["slope_probability"] = up.slope_probability if known else None
+    return found_by_name
 
 
 def _person(person: PersonVerdict, sure: PersonAccuracy) -> dict[str, Any]:

@@ -22,6 +22,7 @@ axis is nearly up.
 
 import dataclasses
 import itertools
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -79,14 +80,20 @@ class Upright:
     normal: Float[np.ndarray, " 3"]
     """Upwards unit normal of the ground's plane; `up` if no plane was found."""
     sigma: float
-    """Standard deviation of `up` along its less certain axis, rad, valid on level and
-    on sloping ground; infinite without any cue."""
+    """Standard deviation of `up` along its less certain axis, rad, over all kinds of
+    ground by their posterior probabilities; infinite without any cue."""
     trunks: float
     """Angle between `up` and the mean direction of trunks, rad; NaN without people."""
     ground: float
     """Estimated slope of the ground, rad; NaN if no ground plane was found."""
     edges: float = np.nan
     """Angle between `up` and the vertical of edges, rad; NaN without such edges."""
+    slope_probability: float = np.nan
+    """Posterior probability that the ground slopes; NaN if no ground plane was found,
+    or nothing else tells up."""
+    sigma_if_sloping: float = np.inf
+    """Standard deviation about `up`, as `sigma`, in the case that the ground slopes,
+    rad; infinite without any cue."""
     unaided: float = np.nan
     """Angle between the measured up direction and the one estimated without it, rad;
     NaN if none was measured."""
@@ -135,11 +142,14 @@ def find_upright(
     worse = _TRUNK_OUTLIER_PROBABILITY[bool((fitted & present.any(axis=1)).any())]
     if measured_up is not None:
         trunk_tilt, worse = _with_measured(trunk_tilt, measured_up), 0.0
-    tilt, slope, sigma = _combined(_tilts(trunk_tilt, worse, edges), ground)
+    found = _combined(_tilts(trunk_tilt, worse, edges), ground)
+    tilt, slope = found.tilt, found.slope
     return Upright(
         up=_direction(tilt),
         normal=_direction(tilt if ground is None else tilt - slope),
-        sigma=sigma,
+        sigma=found.sigma,
+        slope_probability=found.slope_probability,
+        sigma_if_sloping=found.sigma_if_sloping,
         trunks=np.nan
         if trunk_tilt is None
         else float(np.linalg.norm(trunk_tilt[0] - tilt)),
@@ -270,21 +280,35 @@ def _agreement(
     return float(likelihood), explained
 
 
+class _Posterior(NamedTuple):
+    """The posterior of the tilt of up and of the slope of the ground: their means, and
+    the standard deviations of up (`Upright`)."""
+
+    tilt: Float[np.ndarray, " 2"]
+    slope: Float[np.ndarray, " 2"]
+    sigma: float
+    slope_probability: float
+    sigma_if_sloping: float
+
+
 def _combined(
     up_tilts: list[tuple[float, np.ndarray, np.ndarray]], ground: Plane | None
-) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"], float]:
-    """Returns the tilt of up, the slope of the ground, and the standard deviation of up
-    along its less certain axis, rad.
+) -> _Posterior:
+    """Returns the posterior of up given the tilts of trunks and edges (`_tilts`) and
+    the plane of the ground.
 
-    The standard deviation is at least the one about the same tilt on sloping ground:
-    most ground is level, and trunks are too inaccurate to recognise ground that slopes.
+    Up is a mixture: most ground is level, and up is then known to some tenths of a
+    degree; trunks are too inaccurate to recognise ground that slopes, on which up is
+    off by most of the slope.
     """
     unknown = np.full(2, np.nan)
     if not up_tilts:
         if ground is None:
-            return np.zeros(2), unknown, np.inf
+            return _Posterior(np.zeros(2), unknown, np.inf, np.nan, np.inf)
         level = ground.covariance + _LEVEL_SLOPE_SIGMA_RAD**2 * np.eye(2)
-        return -ground.gradient, np.zeros(2), _largest(level)
+        steep = ground.covariance + _STEEP_SLOPE_SIGMA_RAD**2 * np.eye(2)
+        sigma, worst = _largest(level), _largest(steep)
+        return _Posterior(-ground.gradient, np.zeros(2), sigma, np.nan, worst)
     density, tilts, slopes, covariances, is_sloping = [], [], [], [], []
     for p, mean, own in up_tilts:
         if ground is None:
@@ -310,13 +334,18 @@ def _combined(
     weight[-1] += 1e-300
     weight = weight / weight.sum()
     tilt = weight @ np.array(tilts)
-    spread = [c + np.outer(t - tilt, t - tilt) for c, t in zip(covariances, tilts)]
-    sloping_only = weight * np.array(is_sloping)
-    sigma = max(
-        _largest(np.tensordot(share / share.sum(), np.array(spread), 1))
-        for share in (weight, sloping_only)
+    spread = np.array(
+        [c + np.outer(t - tilt, t - tilt) for c, t in zip(covariances, tilts)]
     )
-    return tilt, weight @ np.array(slopes), sigma
+    mean = lambda share: _largest(np.tensordot(share / share.sum(), spread, 1))
+    sloping = weight * np.array(is_sloping)
+    return _Posterior(
+        tilt=tilt,
+        slope=weight @ np.array(slopes),
+        sigma=mean(weight),
+        slope_probability=np.nan if ground is None else float(sloping.sum()),
+        sigma_if_sloping=mean(sloping),
+    )
 
 
 def _largest(covariance: Float[np.ndarray, "2 2"]) -> float:

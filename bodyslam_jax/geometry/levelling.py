@@ -66,7 +66,9 @@ def level(
         _, unaided = level(T_WC, T_WH, feet, present, landmarks, fps, fitted, (), *rest)
         cosine = float(np.clip(unaided.up @ turn[1], -1, 1))
         found = dataclasses.replace(
-            found, unaided=float(np.arccos(cosine)), unaided_sigma=unaided.sigma
+            found,
+            unaided=float(np.arccos(cosine)),
+            unaided_sigma=unaided.sigma_if_sloping,
         )
     return whole, found
 
