@@ -580,7 +580,7 @@ for name in sys.argv[1:]:
     except InputError as error:
         assert name in str(error) and chr(10) not in str(error)
         print("refused")
-# Of this program alone: the maximum that `getrusage` has counts the tests' process, too.
+# Of this program alone: what `getrusage` has counts the process of the tests, too.
 status = Path("/proc/self/status").read_text()
 print(next(x.split()[1] for x in status.splitlines() if x.startswith("VmHWM")))
 """
