@@ -15,7 +15,12 @@ from bodyslam_jax.graph import VARIABLES, Problem, State, check_state
 from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver import baselines
 from bodyslam_jax.solver.batching import sequential_vmap
-from bodyslam_jax.solver.compilation import compiled, in_full_precision
+from bodyslam_jax.solver.compilation import (
+    compiled,
+    in_full_precision,
+    rejoin_bodies,
+    separate_bodies,
+)
 from bodyslam_jax.solver.implicit import cotangent_of_problem
 from bodyslam_jax.solver.levenberg_marquardt import (
     StructuredLevenbergMarquardt,
@@ -24,7 +29,6 @@ from bodyslam_jax.solver.levenberg_marquardt import (
 from bodyslam_jax.solver.lm_state import Final
 from bodyslam_jax.solver.padding import pad, unpad
 from bodyslam_jax.solver.schedule import Solver, Stage, check_names, check_schedule
-from bodyslam_jax.solver.shared_bodies import with_bodies, without_bodies
 from bodyslam_jax.solver.solution import Solution, only, outcome
 
 HISTORY_LENGTH_UNIT = 64
@@ -148,7 +152,7 @@ def run(
 
     `alone` is the value of `is_alone()` before anything was traced.
     """
-    given = *without_bodies(problem), state, method
+    given = *separate_bodies(problem), state, method
     if is_traced(given):
         return sequential_vmap(_program(False), _program(True))(*given)
     return _program(alone)(*given)
@@ -161,7 +165,7 @@ def _program(alone: bool) -> Callable[..., tuple[Solution, Final]]:
 
 @in_full_precision
 def _run(problem, bodies, state, method):
-    problem = with_bodies(problem, bodies)
+    problem = rejoin_bodies(problem, bodies)
     found = optx.least_squares(
         lifted, method, state, problem, max_steps=None, throw=False
     )
