@@ -46,7 +46,7 @@ OWN_FILES = {
     "people/detect.py": "writes what it downloads",
     "cli/main.py": "standard output",
     "cli/unexpected.py": "writes",
-    "graph/memory.py": "the system's own files",
+    "graph/validation.py": "the system's own files",
     "batch/local_engine.py": "the system's own files",
     "export/report.py": "ships with the package",
     "batch/index_page.py": "ships with the package",

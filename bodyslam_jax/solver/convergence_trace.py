@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from bodyslam_jax.geometry.lengths import is_traced
 from bodyslam_jax.graph import Problem, State
-from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.compilation import in_full_precision, quick_jit
 from bodyslam_jax.solver.levenberg_marquardt import lifted

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from bodyslam_jax.geometry.lengths import is_alone, is_traced
 from bodyslam_jax.graph import Problem, State
-from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver.blocks import (
     CAMERAS,
     Linearisation,

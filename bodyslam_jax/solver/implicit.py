@@ -19,8 +19,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from bodyslam_jax.geometry.lengths import is_alone, is_traced
 from bodyslam_jax.graph import LandmarkPrior, Problem, Reprojection, State, Step
-from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.blocks import (
     Linearisation,

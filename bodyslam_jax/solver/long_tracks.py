@@ -1,7 +1,7 @@
 """Landmarks that are eliminated last, with the globals.
 
 A few landmarks that are seen much longer than all others would widen the band of
-cameras for all (`graph/long_tracks.py`). Their blocks become part of the arrow. They
+cameras for all (`graph/ordering.py`). Their blocks become part of the arrow. They
 form one bucket; their coordinates stand group by group, as in its tables: x of all,
 then y, then z.
 """

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from bodyslam_jax.geometry.lengths import is_alone, is_traced
 from bodyslam_jax.graph import VARIABLES, Problem, State, check_state
-from bodyslam_jax.graph.tracing import is_alone, is_traced
 from bodyslam_jax.solver import baselines
 from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.compilation import (

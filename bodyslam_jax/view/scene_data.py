@@ -17,7 +17,7 @@ from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.diagnostics import statistics
 from bodyslam_jax.diagnostics.reported_status import inferred_bones, reported_status
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.ground import feet_on_the_ground
 from bodyslam_jax.view.style import PEOPLE

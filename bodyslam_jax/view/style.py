@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.geometry.arrays import runs
 
 Image = UInt8[np.ndarray, "y x 3"]
 Color = tuple[int, int, int]
