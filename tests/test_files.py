@@ -52,7 +52,7 @@ OWN_FILES = {
     "batch/index_page.py": "ships with the package",
     "view/scene_page.py": "ships with the package, and a run's page",
     "motion/weights.py": "text in memory",
-    "motion/contact_weights.py": "text in memory",
+    "motion/contact_network.py": "text in memory",
     "batch/slurm_engine.py": "values that its own workers write",
     "batch/program_cache.py": "programs that its own workers write",
     # Run and batch folders: files that this package wrote and may find damaged.
@@ -64,7 +64,7 @@ OWN_FILES = {
     "batch/rows.py": "summaries",
     "batch/grid_sweep.py": "rows of a sweep",
     "batch/manifest.py": "text in memory",
-    "experiments/row_cache.py": "rows of an experiment",
+    "experiments/jobs.py": "rows of an experiment",
     "view/serve.py": "the page that it serves",
     "io/capture.py": "cameras and streams, which are no files",
 }
