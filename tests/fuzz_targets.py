@@ -16,7 +16,7 @@ import numpy as np
 
 from bodyslam_jax import evaluation, io, view
 from bodyslam_jax.batch import record, rows, table
-from bodyslam_jax.batch.manifest import read_manifest
+from bodyslam_jax.batch.inputs import read_manifest
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.cli.settings import read_settings
 from bodyslam_jax.config import Config, Known

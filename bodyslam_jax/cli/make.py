@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from bodyslam_jax.cli import jax_setup
-from bodyslam_jax.cli.types import Flat, Input, Preset
+from bodyslam_jax.cli.options import Flat, Input, Preset
 from bodyslam_jax.config import (
     Config,
     Distribution,
