@@ -16,7 +16,7 @@ from body_cases import make_raw, write
 
 import bodyslam_jax
 from bodyslam_jax import cli
-from bodyslam_jax.cli import environment, estimate, jax_setup
+from bodyslam_jax.cli import environment, estimate, folders, jax_setup
 from bodyslam_jax.config import Config
 from bodyslam_jax.export.summary import describe
 from bodyslam_jax.types import Intrinsics, Sequence
@@ -135,14 +135,14 @@ def _a_sequence(name="walk", frames=8):
 def test_a_run_without_a_folder_goes_to_a_free_or_unfinished_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first, second = Path("runs/walk"), Path("runs/walk-2")
-    assert estimate.default_folder(_a_sequence()) == first
+    assert folders.default_folder(_a_sequence()) == first
     (first / ".cache").mkdir(parents=True)
-    assert estimate.default_folder(_a_sequence()) == first
+    assert folders.default_folder(_a_sequence()) == first
     (first / ".cache" / "source.json").write_text(json.dumps(describe(_a_sequence())))
-    assert estimate.default_folder(_a_sequence()) == first
-    assert estimate.default_folder(_a_sequence(frames=9)) == second
+    assert folders.default_folder(_a_sequence()) == first
+    assert folders.default_folder(_a_sequence(frames=9)) == second
     (first / "summary.json").write_text("{}")
-    assert estimate.default_folder(_a_sequence()) == second
+    assert folders.default_folder(_a_sequence()) == second
 
 
 def test_what_is_run_and_where_it_goes_is_the_first_line(

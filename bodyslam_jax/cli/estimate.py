@@ -1,14 +1,7 @@
-"""`bodyslam run`, `demo` and `evaluate`.
+"""`bodyslam run`, `demo` and `evaluate`."""
 
-`default_folder` is where a run is written that names no folder.
-"""
-
-import itertools
 import logging
-import shlex
-import sys
 import webbrowser
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +10,8 @@ import tyro
 from bodyslam_jax.cli import unexpected
 from bodyslam_jax.cli.options import Flat, Input, Preset
 from bodyslam_jax.config import Config
-from bodyslam_jax.types import Sequence
 
 log = logging.getLogger(__name__)
-_ROOT = Path("runs")
-_OPENERS = {"darwin": "open", "win32": "start"}
 
 
 def run(
@@ -62,6 +52,7 @@ def run(
         config: Settings of every stage.
     """
     from bodyslam_jax import io, pipeline
+    from bodyslam_jax.cli.folders import default_folder
 
     sequence = io.read_sequence(
         input,
@@ -110,6 +101,7 @@ def demo(
 def finish(result: Any, out: Path, is_opened: bool = False) -> int:
     """Prints what was found, why it may be doubtful, what was written and the command
     to look at it, and opens the report if `is_opened`; returns the exit code."""
+    from bodyslam_jax.cli.folders import look_at
 
     for line in result.summary["headline"]:
         print(line)
@@ -168,39 +160,3 @@ def evaluate(
 def _announce(what: str, out: Path) -> None:
     """Logs what is run and where the result goes."""
     log.info("%s -> %s", what, out)
-
-
-def default_folder(sequence: Sequence) -> Path:
-    """Returns `runs/NAME`, or `runs/NAME-2` and so on where an earlier run is finished.
-
-    An unfinished run of the same input is continued.
-    """
-    is_ours = lambda folder: _is_unfinished(folder, sequence)
-    return free_folder(sequence.name or "run", is_ours)
-
-
-def free_folder(
-    name: str, is_ours: Callable[[Path], bool] = lambda folder: False
-) -> Path:
-    """Returns the first of `runs/NAME`, `runs/NAME-2` and so on that does not exist or
-    for which `is_ours` is true."""
-    for number in itertools.count(1):
-        folder = _ROOT / (name if number == 1 else f"{name}-{number}")
-        if not folder.exists() or is_ours(folder):
-            return folder
-    raise AssertionError("unreachable")
-
-
-def look_at(folder: Path) -> str:
-    """Returns the command that opens a run's report."""
-    opener = _OPENERS.get(sys.platform, "xdg-open")
-    return f"{opener} {shlex.quote(str(folder / 'report.html'))}"
-
-
-def _is_unfinished(folder: Path, sequence: Sequence) -> bool:
-    from bodyslam_jax.export.summary import describe
-    from bodyslam_jax.pipeline.stage_cache import Cache
-
-    if any(not entry.name.startswith(".") for entry in folder.iterdir()):
-        return False
-    return Cache(folder / ".cache").owner() in (None, describe(sequence))

@@ -62,7 +62,7 @@ def live(
             --end, --height, --camera-path, --person) is refused.
     """
     from bodyslam_jax import export
-    from bodyslam_jax.cli.estimate import free_folder
+    from bodyslam_jax.cli.folders import free_folder
     from bodyslam_jax.io.camera.calibration import read_camera
     from bodyslam_jax.io.capture import Capture
     from bodyslam_jax.online import Online
