@@ -125,8 +125,8 @@ def sweep(
         config: Settings of every stage.
     """
     from bodyslam_jax import batch as batch_
+    from bodyslam_jax.batch.engines import prepared
     from bodyslam_jax.batch.grid import parse_axes
-    from bodyslam_jax.batch.worker import prepared
 
     try:
         axes = parse_axes(grid, config)

@@ -143,7 +143,7 @@ def experiment(
     if name == "scale" and engine is None:
         _make_each_core_a_device()
     from bodyslam_jax import batch, experiments
-    from bodyslam_jax.batch.worker import prepared
+    from bodyslam_jax.batch.engines import prepared
 
     log.info("experiment: %s -> %s", name, out)
     elsewhere, setup = None, None
