@@ -27,8 +27,8 @@ from bodyslam_jax.simulation import sequences
 from bodyslam_jax.simulation.camera_paths import FPS, HANDLING, film_room
 from bodyslam_jax.simulation.gait_synthesis import Soles
 from bodyslam_jax.simulation.posing import Person
-from bodyslam_jax.simulation.recorded import play
 from bodyslam_jax.simulation.room import furnish
+from bodyslam_jax.simulation.sequences import play
 
 JUMPS = ("02_04", "13_11", "13_39")
 DISTANCE = 4.0

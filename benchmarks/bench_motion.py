@@ -59,7 +59,7 @@ def in_jax(rounds):
         predict,
         read_motion,
     )
-    from bodyslam_jax.motion.training import losses, sampling
+    from bodyslam_jax.motion.training import sampling, train
     from bodyslam_jax.motion.training import train as training
 
     wait = jax.block_until_ready
@@ -83,7 +83,7 @@ def in_jax(rounds):
     @jax.jit
     def step(moving, state):
         gradient = jax.grad(
-            lambda m: losses.loss(eqx.combine(m, fixed), batch, settings)
+            lambda m: train.loss(eqx.combine(m, fixed), batch, settings)
         )(moving)
         change, state = update.update(gradient, state, moving)
         return optax.apply_updates(moving, change), state

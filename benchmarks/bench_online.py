@@ -30,7 +30,7 @@ import numpy as np
 import bodyslam_jax as bs
 from bodyslam_jax import evaluation, io, simulation
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.io.selection import select_frames
+from bodyslam_jax.io.sequence import select_frames
 from bodyslam_jax.online import Estimate, Online
 from bodyslam_jax.simulation.exact_scene import look_at
 from bodyslam_jax.types import Result, Sequence

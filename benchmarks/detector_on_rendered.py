@@ -12,8 +12,7 @@ import numpy as np
 
 from bodyslam_jax import io, pipeline, simulation
 from bodyslam_jax.config import Simulation
-from bodyslam_jax.experiments.detector import detection_figures
-from bodyslam_jax.experiments.video import filmed
+from bodyslam_jax.experiments.video import detection_figures, filmed
 from bodyslam_jax.experiments.video_table import keypoint_table
 
 

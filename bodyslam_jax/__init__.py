@@ -75,6 +75,23 @@ _HOME = {
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
+def _export(*args: Any, **more: Any) -> Any:
+    from bodyslam_jax.export.formats import export
+
+    return export(*args, **more)
+
+
+def _view(*args: Any, **more: Any) -> Any:
+    from bodyslam_jax.view import notebook_scene
+
+    return notebook_scene(*args, **more)
+
+
+USES_OF_RESULTS = {"export": _export, "view": _view}
+"""Functions behind the methods of `Result`, whose module is below those that write and
+show a result."""
+
+
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'bodyslam_jax' has no attribute {name!r}")

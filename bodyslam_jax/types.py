@@ -9,7 +9,8 @@ from C to W. Axes: `t` frames, `h` people, `l` landmarks, `m` observations.
 """
 
 import dataclasses
-import importlib
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -435,12 +436,18 @@ class Result:
     ) -> list[Path]:
         """Writes the result for other programs, in the formats `to` or the one that the
         suffix of `path` names; all options are those of `export.formats.export`."""
-        # By name: this module is below the one that writes, and imports no JAX.
-        formats = importlib.import_module("bodyslam_jax.export.formats")
-        return formats.export(self, Path(path), to, up, person, **more)
+        return _use("export")(self, Path(path), to, up, person, **more)
 
     def view(self, run: Path | str | None = None, **more: Any) -> Any:
         """Shows the result in 3D in a notebook, with images of the video if its run
         folder is given. All options are those of `view.notebook_scene`."""
-        view = importlib.import_module("bodyslam_jax.view")
-        return view.notebook_scene(self, None if run is None else Path(run), **more)
+        return _use("view")(self, None if run is None else Path(run), **more)
+
+
+def _use(name: str) -> Callable[..., Any]:
+    """Returns the function that the package has registered for a method of `Result`.
+
+    The packages that write and show results are above this module, which imports none
+    of them.
+    """
+    return sys.modules[__name__.partition(".")[0]].USES_OF_RESULTS[name]

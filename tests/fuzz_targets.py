@@ -16,7 +16,7 @@ import numpy as np
 
 from bodyslam_jax import evaluation, io, view
 from bodyslam_jax.batch import record, rows, table
-from bodyslam_jax.batch.manifest import read_manifest
+from bodyslam_jax.batch.inputs import read_manifest
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.cli.settings import read_settings
 from bodyslam_jax.config import Config, Known
@@ -30,7 +30,7 @@ from bodyslam_jax.io.keypoints.reader import read_detections
 from bodyslam_jax.io.safe_pickle import restricted_load
 from bodyslam_jax.io.tracks import read_tracks
 from bodyslam_jax.motion import load_motion_model, read_motion
-from bodyslam_jax.motion.contact_weights import load_contact_model
+from bodyslam_jax.motion.contact_network import load_contact_model
 from bodyslam_jax.pipeline.stage_cache import Cache, save
 from bodyslam_jax.types import Intrinsics, Result, Tracks
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bodyslam_jax.batch import find_inputs
-from bodyslam_jax.batch.manifest import read_manifest
+from bodyslam_jax.batch.inputs import read_manifest
 from bodyslam_jax.config import Config
 
 HEADER = "name,video,keypoints,bodies,camera,height,groundtruth,options"

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from bodyslam_jax import body
-from bodyslam_jax.body.kinematics_numpy import pose_joints
+from bodyslam_jax.body.skeleton import pose_joints
 from bodyslam_jax.geometry import so3_numpy
 
 N = 5  # frames; one size for all tests, so that little is compiled

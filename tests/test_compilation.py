@@ -8,7 +8,7 @@ import pytest
 
 from bodyslam_jax import evaluation, pipeline, simulation
 from bodyslam_jax.config import Config, Simulation
-from bodyslam_jax.graph.tracing import is_alone
+from bodyslam_jax.geometry.lengths import is_alone
 from bodyslam_jax.solver import compilation
 
 

@@ -19,8 +19,8 @@ from bodyslam_jax.evaluation.plausibility import posture_figures
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.geometry.stances import find_stances
 from bodyslam_jax.initialisation import mean_up
-from bodyslam_jax.motion.capture.contact_labels import standing_points
 from bodyslam_jax.motion.contact_network import windows_within
+from bodyslam_jax.motion.training.contact import standing_points
 from bodyslam_jax.pipeline import contact_stage, joint_problem
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet, stand_on_plane
 from bodyslam_jax.simulation import sequences

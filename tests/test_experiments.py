@@ -24,17 +24,15 @@ from bodyslam_jax.experiments import (
     figures,
     paper,
     plans,
-    provenance,
     reports,
     tables,
     weights,
 )
+from bodyslam_jax.experiments.ablation import shake
+from bodyslam_jax.experiments.jobs import Journal, fits
 from bodyslam_jax.experiments.plans import PLANS
-from bodyslam_jax.experiments.problems import with_scale
-from bodyslam_jax.experiments.row_cache import Journal, fits
-from bodyslam_jax.experiments.scenario import simulations
+from bodyslam_jax.experiments.scenario import simulations, with_scale
 from bodyslam_jax.experiments.scoring import NAMES, PLAUSIBILITY_FIGURES
-from bodyslam_jax.experiments.structural_landmarks import shake
 from bodyslam_jax.pipeline.case import trajectories
 
 SHORT = (solver.Stage(("scale", "roots"), max_steps=8),)
@@ -483,18 +481,18 @@ def test_what_is_not_finite_stays_missing(tmp_path, made_up):
 @pytest.mark.usefixtures("undrawn")
 def test_tables_say_what_is_not_as_by_default(tmp_path, made_up, monkeypatch):
     named = lambda setting: setting and Path(setting)
-    monkeypatch.setattr(provenance, "body_model_file", named)
-    plain = provenance.about(Experiment(), Config())
+    monkeypatch.setattr(reports, "body_model_file", named)
+    plain = reports.about(Experiment(), Config())
     assert plain == "Simulated sequences, noise level `real`."
     weights = dataclasses.replace(Config().weights, pixel_sigma=2.0)
     config = Config(weights=weights, motion_model="m.npz", body_model="b.npz")
-    assert provenance.about(Experiment(motion="walk.npz"), config) == (
+    assert reports.about(Experiment(motion="walk.npz"), config) == (
         f"{plain} Not as by default: motion of `walk.npz`; `body_model` b.npz; "
         "`motion_model` m.npz; `weights.pixel_sigma` 2.0."
     )
     paper = dataclasses.replace(Config.paper(), motion_coupling="refreshed")
     told = "Not as by default: preset `paper`; `motion_coupling` refreshed."
-    assert provenance.deviations(Experiment(), paper) == told
+    assert reports.deviations(Experiment(), paper) == told
     on, _ = made_up
     for seed in (3, 4):
         again = dataclasses.replace(on, seed=seed)

@@ -9,9 +9,9 @@ from bodyslam_jax import evaluation, simulation
 from bodyslam_jax.body import KEYPOINT_NAMES, load_body_model
 from bodyslam_jax.config import Config, Experiment
 from bodyslam_jax.experiments import video
-from bodyslam_jax.experiments.detector import detection_figures
+from bodyslam_jax.experiments.jobs import fits
 from bodyslam_jax.experiments.plans import PLANS
-from bodyslam_jax.experiments.row_cache import fits
+from bodyslam_jax.experiments.video import detection_figures
 from bodyslam_jax.experiments.video_table import write_video
 from bodyslam_jax.pipeline.stage_cache import fingerprint
 from bodyslam_jax.types import Keypoints

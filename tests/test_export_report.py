@@ -13,7 +13,7 @@ from bodyslam_jax import export, view
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.diagnostics import statistics, thresholds
 from bodyslam_jax.export.figures import person_variable
-from bodyslam_jax.export.plain_words import in_plain_words
+from bodyslam_jax.export.report import in_plain_words
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.style import PEOPLE
 

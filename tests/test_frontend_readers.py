@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from bodyslam_jax.config import Association
 from bodyslam_jax.io import read_sequence
 from bodyslam_jax.io.bodies.body_format import body_formats
-from bodyslam_jax.io.bodies.perspective import full_translation
+from bodyslam_jax.io.bodies.parts import full_translation
 from bodyslam_jax.io.bodies.reader import read_bodies
 from bodyslam_jax.io.camera.calibration import (
     as_opencv,

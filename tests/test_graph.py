@@ -18,8 +18,11 @@ from problems import bent, make
 import bodyslam_jax.graph as g
 from bodyslam_jax.body import local_keypoints
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.graph.keypoint_curvature import keypoint_curvature
-from bodyslam_jax.graph.keypoint_jacobian import carried_by_joints, keypoint_jacobian
+from bodyslam_jax.graph.keypoint_jacobian import (
+    carried_by_joints,
+    keypoint_curvature,
+    keypoint_jacobian,
+)
 
 
 @pytest.fixture

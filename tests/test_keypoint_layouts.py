@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyslam_jax.io.keypoints.layouts import LAYOUTS, from_layout
-from bodyslam_jax.io.keypoints.names import layout_of, names_in
+from bodyslam_jax.io.keypoints.layouts import LAYOUTS, from_layout, layout_of, names_in
 from bodyslam_jax.io.keypoints.reader import read_detections
 
 NUM, WIDTH, HEIGHT = 24, 640, 480

@@ -36,9 +36,8 @@ from bodyslam_jax.motion.position_network import (
     cosine_basis,
     nearest_turn,
 )
-from bodyslam_jax.motion.prediction import leg_length
-from bodyslam_jax.motion.training.measures import Steps, error_correlation
-from bodyslam_jax.motion.yaw_removal import straightened
+from bodyslam_jax.motion.prediction import leg_length, straightened
+from bodyslam_jax.motion.training.evaluation import Steps, error_correlation
 from bodyslam_jax.types import Intrinsics, Keypoints, Sequence
 
 T = 24

@@ -21,7 +21,7 @@ from bodyslam_jax.motion.capture.clips import (
     split,
 )
 from bodyslam_jax.motion.capture.readers import gender
-from bodyslam_jax.motion.training.noise import CORRELATION
+from bodyslam_jax.motion.training.sampling import CORRELATION
 
 
 def make_clip(t=50, fps=30.0, seed=0, **changes):

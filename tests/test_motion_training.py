@@ -29,8 +29,8 @@ from bodyslam_jax.motion import (
     train,
 )
 from bodyslam_jax.motion.paper_network import PaperNetwork
-from bodyslam_jax.motion.training.losses import loss
 from bodyslam_jax.motion.training.sampling import corpus, draw
+from bodyslam_jax.motion.training.train import loss
 
 NOISY = MotionTraining(
     past=4,

@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import sfm
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io.camera.path import read_camera_path
-from bodyslam_jax.io.camera.tum import write_tum
+from bodyslam_jax.io.camera.path import read_camera_path, write_tum
 from bodyslam_jax.sfm.given_path import PathTest
 from bodyslam_jax.types import CameraPath, Intrinsics, Tracks
 

@@ -13,7 +13,7 @@ import pytest
 import scenes
 
 import bodyslam_jax.graph as g
-from bodyslam_jax.graph import memory
+from bodyslam_jax.graph import validation
 from bodyslam_jax.graph.padding import Masked
 from bodyslam_jax.solver.padding import pad
 from bodyslam_jax.solver.solve import method_of, run
@@ -221,7 +221,7 @@ def test_a_problem_too_large_for_memory_reports_how_many_frames_fit(monkeypatch)
         rng = np.random.default_rng(0)
         return scenes.truth(rng, frames, 6, 0)
 
-    monkeypatch.setattr(memory, "memory", lambda: 2**30)
+    monkeypatch.setattr(validation, "memory", lambda: 2**30)
     with pytest.raises(
         ValueError, match=r"need about \d\.\d GiB, found 1\.0 GiB"
     ) as error:
@@ -253,7 +253,7 @@ def test_memory_of_long_tracks_is_counted_in_every_chunk(monkeypatch):
         soon = tuple(dataclasses.replace(b, lasting=False) for b in layout.buckets)
         without = dataclasses.replace(layout, buckets=soon)
         counted, others = (
-            memory.memory_needed(x, state, 69) for x in (layout, without)
+            validation.memory_needed(x, state, 69) for x in (layout, without)
         )
         return np.array([kept.size * kept.dtype.itemsize, counted - others])
 
@@ -264,10 +264,10 @@ def test_memory_of_long_tracks_is_counted_in_every_chunk(monkeypatch):
 def test_memory_limits_of_containers_are_read(monkeypatch, tmp_path):
     limit, other = tmp_path / "memory.max", tmp_path / "none"
     limit.write_text("1048576\n")
-    monkeypatch.setattr(memory, "_CGROUP_LIMIT_FILES", (str(other), str(limit)))
-    assert memory.memory() == 2**20
+    monkeypatch.setattr(validation, "_CGROUP_LIMIT_FILES", (str(other), str(limit)))
+    assert validation.memory() == 2**20
     limit.write_text("max\n")
-    assert memory.memory() > 2**28
+    assert validation.memory() > 2**28
 
 
 def test_under_a_transformation_only_shapes_are_checked():
@@ -310,7 +310,7 @@ def test_a_video_too_long_to_order_reports_how_many_frames_fit(monkeypatch):
         raise AssertionError("a dense table of chunks")
 
     monkeypatch.setattr("bodyslam_jax.graph.ordering._spectral", reached)
-    monkeypatch.setattr(memory, "memory", lambda: 2**27)
+    monkeypatch.setattr(validation, "memory", lambda: 2**27)
     count = 10 * 3000
     landmark = np.repeat(np.arange(3000), 2)
     frame = 10 * landmark + np.tile([0, 5], 3000)

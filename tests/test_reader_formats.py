@@ -27,7 +27,7 @@ PACKAGE = f"""
     import numpy as np
 
     from bodyslam_jax.io.bodies.body_format import BodyFormat
-    from bodyslam_jax.io.bodies.body_records import Rows
+    from bodyslam_jax.io.bodies.parts import Rows
     from bodyslam_jax.io.files import read_csv
     from bodyslam_jax.io.keypoints.keypoint_format import KeypointFormat, Listed
 

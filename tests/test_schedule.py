@@ -10,7 +10,7 @@ from bodyslam_jax import graph, solver
 from bodyslam_jax.config import Config
 from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.solver import PAPER_SCHEDULE, Solution, Stage
-from bodyslam_jax.solver.schedule import check_names, check_schedule
+from bodyslam_jax.solver.solve import check_names, check_schedule
 
 
 def test_the_papers_schedule_has_its_numbers_of_first_order_steps():

@@ -30,7 +30,7 @@ from bodyslam_jax.solver import (
 from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.blocks import sizes_of
 from bodyslam_jax.solver.compilation import quick_options
-from bodyslam_jax.solver.gmres import MAX_DIRECTIONS, gmres
+from bodyslam_jax.solver.implicit import MAX_DIRECTIONS, gmres
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.padding import pad

@@ -12,7 +12,7 @@ from bodyslam_jax.motion import read_motion
 from bodyslam_jax.people import lift, posture_prior
 from bodyslam_jax.simulation.gait_synthesis import Soles
 from bodyslam_jax.simulation.posing import Person
-from bodyslam_jax.simulation.recorded import OTHER, RECORDINGS, play
+from bodyslam_jax.simulation.sequences import OTHER, RECORDINGS, play
 
 
 @pytest.fixture(scope="module")

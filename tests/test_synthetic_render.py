@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from bodyslam_jax.body import load_body_model
+from bodyslam_jax.simulation.body_regions import PARTS, Outfit
 from bodyslam_jax.simulation.exact_scene import look_at, walk
 from bodyslam_jax.simulation.figure import Figure, dress
-from bodyslam_jax.simulation.outfit import PARTS, Outfit
 from bodyslam_jax.simulation.posing import Person
 from bodyslam_jax.simulation.raster import rasterise
 from bodyslam_jax.simulation.renderer import Renderer, write_video

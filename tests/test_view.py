@@ -11,7 +11,7 @@ import pytest
 from bodyslam_jax import view
 from bodyslam_jax.body import joints, keypoints, load_body_model, skeleton, write_npz
 from bodyslam_jax.types import Keypoints, Result, Tracks
-from bodyslam_jax.view import insets, overlay, person_style, top_view, video_file
+from bodyslam_jax.view import insets, overlay, style, video_file
 
 WIDTH, HEIGHT = 160, 120
 
@@ -130,7 +130,7 @@ def test_a_frame_that_is_not_there_is_named(body, frame):
 def test_the_inset_has_a_grid_for_scenes_of_any_size(body, size):
     result = _scene(body)
     result.T_WC[:, 0, 3] = np.linspace(0, size, 4)
-    plan = top_view.Plan(result, (WIDTH, HEIGHT))
+    plan = insets.Plan(result, (WIDTH, HEIGHT))
     assert plan.step >= 1 and plan.side / plan.zoom / plan.step <= 10.001
 
 
@@ -345,16 +345,16 @@ def test_the_status_of_people_is_drawn(body):
     (u, v) = _pixels(plain)[0].astype(int)
     change = {s: np.abs(drawn(s)[0][v, u] - 90).max() for s in ("ok", "not_measurable")}
     assert 0 < change["not_measurable"] < 0.7 * change["ok"]
-    color = np.array(person_style.person_styles(plain)[0].color)
+    color = np.array(style.person_styles(plain)[0].color)
     line = lambda s: (np.abs(drawn(s)[0] - color).max(axis=-1) < 30).sum()
     assert 20 < line("doubtful") < 0.85 * line("ok")
     x, y = _pixels(plain)[[18, 20]].mean(0).astype(int)
     measured, hidden = (drawn("ok", h)[0][y, x].sum() for h in ((), (20,)))
     assert hidden > measured + 30
     _, result = drawn("doubtful")
-    styles = person_style.person_styles(result)
+    styles = style.person_styles(result)
     assert styles[0].name == "person 0, doubtful"
-    assert person_style.Legend(result, styles).entries == {"doubtful": styles[0].dash}
+    assert style.Legend(result, styles).entries == {"doubtful": styles[0].dash}
 
 
 def _at(result, u, v, depth=4.0):
@@ -422,7 +422,7 @@ def test_the_person_in_the_image_shows_through_the_body(body):
     body_pixels = (drawn != 128).any(-1)
     inner = cv2.erode(body_pixels.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     rim = drawn[body_pixels & ~inner]
-    colour = np.array(person_style.person_styles(result)[0].color)
+    colour = np.array(style.person_styles(result)[0].color)
     assert (np.abs(rim - colour).max(axis=-1) < 25).mean() > 0.2
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from bodyslam_jax.batch.driver import run_many as run_many
     from bodyslam_jax.batch.engine import Engine as Engine
     from bodyslam_jax.batch.engine import Failure as Failure
-    from bodyslam_jax.batch.engine import make_engine as make_engine
+    from bodyslam_jax.batch.engines import make_engine as make_engine
     from bodyslam_jax.batch.grid_sweep import sweep as sweep
     from bodyslam_jax.batch.inputs import Input as Input
     from bodyslam_jax.batch.inputs import find_inputs as find_inputs
@@ -28,7 +28,7 @@ _MODULES = {
     "Outcome": "job",
     "collect": "collection",
     "find_inputs": "inputs",
-    "make_engine": "engine",
+    "make_engine": "engines",
     "run_many": "driver",
     "sweep": "grid_sweep",
 }

@@ -10,7 +10,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from bodyslam_jax.batch import failures, record
-from bodyslam_jax.batch.engine import Engine, Failure, Setup, make_engine
+from bodyslam_jax.batch.engine import Engine, Failure, Setup
+from bodyslam_jax.batch.engines import CallersJax, make_engine, prepared
 from bodyslam_jax.batch.inputs import (
     BATCH_FILE,
     RUNS_FOLDER,
@@ -27,7 +28,6 @@ from bodyslam_jax.batch.job import (
     finished,
     run_job,
 )
-from bodyslam_jax.batch.worker import CallersJax, prepared
 from bodyslam_jax.config import Config, Distribution
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic

@@ -8,8 +8,6 @@ import dataclasses
 from collections.abc import Callable, Generator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-from bodyslam_jax.config import Distribution
-
 Setup = Callable[[], None]
 """Prepares a new process, once, before its first item."""
 Values = Generator[tuple[Any, Any], None, None]
@@ -38,34 +36,6 @@ class Engine(Protocol):
         **Raises:** `ValueError` if `setup` fails or the engine is not available.
         """
         ...
-
-
-def make_engine(distribution: Distribution, folder: Any, gpu: bool) -> Engine:
-    """Returns the engine that the settings name.
-
-    Args:
-        folder: folder for the engine's own files, accessible from all machines.
-        gpu: whether GPUs are used if there are any.
-    """
-    if distribution.engine == "ray":
-        from bodyslam_jax.batch.ray_engine import RayEngine
-
-        return RayEngine(
-            distribution.workers, distribution.retries, distribution.ray_address, gpu
-        )
-    if distribution.engine == "slurm":
-        from bodyslam_jax.batch.slurm_engine import SlurmEngine
-
-        return SlurmEngine(
-            folder,
-            distribution.workers,
-            distribution.retries,
-            distribution.slurm_minutes,
-            distribution.slurm_parameters(),
-        )
-    from bodyslam_jax.batch.local_engine import LocalEngine
-
-    return LocalEngine(distribution.workers, distribution.retries, gpu)
 
 
 def attempt(function: Callable[[Any], Any], item: Any) -> Any:

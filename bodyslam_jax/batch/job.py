@@ -13,8 +13,7 @@ from typing import Any, Literal
 from bodyslam_jax.batch import record
 from bodyslam_jax.batch.inputs import Input
 from bodyslam_jax.config import Config
-from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.io.error_line import error_line
+from bodyslam_jax.config.errors import InputError, error_line
 
 log = logging.getLogger(__name__)
 Status = Literal["ok", "doubtful", "failed", "error"]

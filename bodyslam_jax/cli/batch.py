@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from bodyslam_jax.cli import jax_setup
-from bodyslam_jax.cli.types import Flat, Input, Preset
+from bodyslam_jax.cli.options import Flat, Input, Preset
 from bodyslam_jax.config import Config, Distribution
 from bodyslam_jax.config.errors import InputError
 
@@ -125,8 +125,8 @@ def sweep(
         config: Settings of every stage.
     """
     from bodyslam_jax import batch as batch_
+    from bodyslam_jax.batch.engines import prepared
     from bodyslam_jax.batch.grid import parse_axes
-    from bodyslam_jax.batch.worker import prepared
 
     try:
         axes = parse_axes(grid, config)

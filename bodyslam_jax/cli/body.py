@@ -5,7 +5,7 @@ from typing import Literal
 
 import tyro
 
-from bodyslam_jax.cli.types import Input
+from bodyslam_jax.cli.options import Input
 
 _Gender = Literal["neutral", "female", "male"]
 

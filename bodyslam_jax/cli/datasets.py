@@ -4,7 +4,7 @@ from pathlib import Path
 
 import tyro
 
-from bodyslam_jax.cli.types import Input
+from bodyslam_jax.cli.options import Input
 
 _Out = tyro.conf.Positional[Path]
 

@@ -8,7 +8,7 @@ from typing import Any
 import tyro
 
 from bodyslam_jax.cli import unexpected
-from bodyslam_jax.cli.types import Flat, Input, Preset
+from bodyslam_jax.cli.options import Flat, Input, Preset
 from bodyslam_jax.config import Config
 
 log = logging.getLogger(__name__)

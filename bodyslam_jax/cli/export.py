@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from bodyslam_jax.cli.types import Input
+from bodyslam_jax.cli.options import Input
 
 Formats = Literal[
     "glb",

@@ -10,7 +10,7 @@ import tyro
 
 from bodyslam_jax.cli import interrupts, unexpected
 from bodyslam_jax.cli.estimate import finish
-from bodyslam_jax.cli.types import Flat, Preset
+from bodyslam_jax.cli.options import Flat, Preset
 from bodyslam_jax.config import Config
 
 log = logging.getLogger(__name__)

@@ -51,7 +51,7 @@ def main() -> NoReturn:
         print(f"bodyslam: {error}", file=sys.stderr)
         sys.exit(2)
     except Exception as error:
-        from bodyslam_jax.io.error_line import error_line
+        from bodyslam_jax.config.errors import error_line
 
         if interrupts.arrived():
             _leave_interrupted()

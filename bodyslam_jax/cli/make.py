@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from bodyslam_jax.cli import jax_setup
-from bodyslam_jax.cli.types import Flat, Input, Preset
+from bodyslam_jax.cli.options import Flat, Input, Preset
 from bodyslam_jax.config import (
     Config,
     Distribution,
@@ -143,7 +143,7 @@ def experiment(
     if name == "scale" and engine is None:
         _make_each_core_a_device()
     from bodyslam_jax import batch, experiments
-    from bodyslam_jax.batch.worker import prepared
+    from bodyslam_jax.batch.engines import prepared
 
     log.info("experiment: %s -> %s", name, out)
     elsewhere, setup = None, None

@@ -2,6 +2,8 @@
 
 They are read from the command's signature, its docstring and the dataclasses of its
 settings. Help, documentation and suggestions are made from them; tyro parses.
+
+Several commands share the types `Input`, `Preset` and `Flat` of arguments.
 """
 
 import ast
@@ -13,7 +15,11 @@ import types
 import typing
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from bodyslam_jax.config import Config
 
 GENERAL = {
     "--quiet": "Prints results, warnings and errors only, no progress.",
@@ -34,6 +40,10 @@ _VALUES = {
     "camera_path": "FILE",
 }
 _KINDS = {int: "N", float: "NUMBER", str: "TEXT", Path: "PATH"}
+Input = tyro.conf.Positional[Path]
+Preset = Literal["default", "paper"]
+Flat = Annotated[Config, tyro.conf.arg(name="")]
+"""Settings whose names are options: `--weights.pixel-sigma`."""
 
 
 @dataclasses.dataclass(frozen=True)

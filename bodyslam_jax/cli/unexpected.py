@@ -75,7 +75,7 @@ def write_details(error: BaseException, folder: Path | None = None) -> Path:
 
 def line(error: BaseException) -> str:
     """Returns the line that reports an unexpected error."""
-    from bodyslam_jax.io.error_line import error_line
+    from bodyslam_jax.config.errors import error_line
 
     details = error.details if isinstance(error, Unexpected) else write_details(error)
     cause = error.error if isinstance(error, Unexpected) else error

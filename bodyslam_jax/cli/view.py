@@ -5,7 +5,7 @@ import webbrowser
 from pathlib import Path
 from typing import Any
 
-from bodyslam_jax.cli.types import Input
+from bodyslam_jax.cli.options import Input
 
 log = logging.getLogger(__name__)
 

@@ -4,7 +4,6 @@ The command line and `config.yaml` are generated from these classes. The package
 not import JAX, so that `--help` is quick.
 """
 
-from bodyslam_jax.config.batch import Distribution as Distribution
 from bodyslam_jax.config.front_end import Association as Association
 from bodyslam_jax.config.front_end import Detect as Detect
 from bodyslam_jax.config.front_end import PeopleFit as PeopleFit
@@ -22,6 +21,7 @@ from bodyslam_jax.config.options import removed as removed
 from bodyslam_jax.config.options import with_options as with_options
 from bodyslam_jax.config.options import with_values as with_values
 from bodyslam_jax.config.run import Config as Config
+from bodyslam_jax.config.run import Distribution as Distribution
 from bodyslam_jax.config.run import Limits as Limits
 from bodyslam_jax.config.simulation import Experiment as Experiment
 from bodyslam_jax.config.simulation import Simulation as Simulation

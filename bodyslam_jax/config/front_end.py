@@ -7,7 +7,7 @@ structure from motion.
 import dataclasses
 import math
 
-from bodyslam_jax.config.check import NOT_NEGATIVE, Range, check
+from bodyslam_jax.config.errors import NOT_NEGATIVE, Range, check
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,8 +10,7 @@ import math
 import re
 from typing import Literal, NamedTuple
 
-from bodyslam_jax.config.check import NOT_NEGATIVE, check
-from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.config.errors import NOT_NEGATIVE, InputError, check
 
 HEIGHT_SIGMA = 0.02
 """Standard deviation of a stature, m. Self-reported statures are 1 cm too tall on

@@ -3,8 +3,7 @@
 import dataclasses
 from typing import Literal
 
-from bodyslam_jax.config.check import NOT_NEGATIVE, SHARE, check
-from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.config.errors import NOT_NEGATIVE, SHARE, InputError, check
 
 _SHARE_FIELDS = "future averaging clean_share"
 _NOT_NEGATIVE_FIELDS = (

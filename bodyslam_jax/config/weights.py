@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from bodyslam_jax.config.check import NOT_NEGATIVE, check
+from bodyslam_jax.config.errors import NOT_NEGATIVE, check
 
 _MAX_CORRELATION = 0.999999
 """Largest AR(1) coefficient: constant errors would be indistinguishable from the

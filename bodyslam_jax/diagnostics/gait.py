@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.types import Result
 
 _GRAVITY_M_S2 = 9.81

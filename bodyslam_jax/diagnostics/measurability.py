@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from bodyslam_jax import people
 from bodyslam_jax.body.skeleton import PELVIS
 from bodyslam_jax.diagnostics.measured import Measured, pixels_per_metre
-from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.people.costs import KEYPOINT_SIGMA
 from bodyslam_jax.people.keypoint_errors import CORRELATION_TIME, MIN_DETECTOR_SIGMA_PX
 from bodyslam_jax.types import JointEstimate, Keypoints, Result, Sequence

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax.body.skeleton import PELVIS
 from bodyslam_jax.diagnostics import posture
-from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.geometry.arrays import runs
 
 Frames = tuple[int, int]
 """First and last frame."""

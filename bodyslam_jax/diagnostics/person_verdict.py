@@ -17,7 +17,7 @@ from bodyslam_jax.diagnostics.statistics import (
     stature_and_sigma,
 )
 from bodyslam_jax.diagnostics.thresholds import MEASURABLE_CHECKS
-from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.types import JointEstimate, Result, Sequence
 
 PersonStatus = Literal["ok", "doubtful", "not_measurable", "absent"]

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body import stature as stature
 from bodyslam_jax.body.skeleton import FEET
-from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.types import Result
 
 _UP_AXIS = 1

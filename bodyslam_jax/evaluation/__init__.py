@@ -38,12 +38,12 @@ from bodyslam_jax.evaluation.metrics import (
 )
 from bodyslam_jax.evaluation.metrics import trajectory_error as trajectory_error
 from bodyslam_jax.evaluation.metrics import world_mpjpe as world_mpjpe
-from bodyslam_jax.evaluation.padding import pad_frames as pad_frames
 from bodyslam_jax.evaluation.plausibility import FIGURES as FIGURES
 from bodyslam_jax.evaluation.readers import body_of_run as body_of_run
 from bodyslam_jax.evaluation.readers import check_body as check_body
 from bodyslam_jax.evaluation.readers import read_groundtruth as read_groundtruth
 from bodyslam_jax.evaluation.readers import read_result as read_result
+from bodyslam_jax.evaluation.readers import read_summary as read_summary
 from bodyslam_jax.evaluation.readers import read_tum as read_tum
 from bodyslam_jax.evaluation.report import ROWS as ROWS
 from bodyslam_jax.evaluation.report import describe as describe
@@ -51,4 +51,4 @@ from bodyslam_jax.evaluation.report import gaps as gaps
 from bodyslam_jax.evaluation.report import to_json as to_json
 from bodyslam_jax.evaluation.report import to_rows as to_rows
 from bodyslam_jax.evaluation.report import to_table as to_table
-from bodyslam_jax.evaluation.run_summary import read_summary as read_summary
+from bodyslam_jax.evaluation.resampling import pad_frames as pad_frames

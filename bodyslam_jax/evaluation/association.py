@@ -24,12 +24,15 @@ from bodyslam_jax.evaluation.errors import (
     evaluate_trajectories,
 )
 from bodyslam_jax.evaluation.metrics import Errors, trajectory_error
-from bodyslam_jax.evaluation.padding import bucket, pad_frames, pad_people, to_bucket
 from bodyslam_jax.evaluation.resampling import (
     Samples,
+    bucket,
     interval_of,
+    pad_frames,
+    pad_people,
     resample,
     samples_of,
+    to_bucket,
     without_holes,
 )
 from bodyslam_jax.types import Result
@@ -50,7 +53,7 @@ def evaluate(
     arguments `body` and `offset` (s). Two `Trajectories` are compared as they are; for
     these the function can be jitted, vmapped and differentiated:
     `jax.jit(jax.vmap(evaluate))(*stack_pairs(pairs))`. Lengths are padded to a few
-    (`padding.bucket`), each of which is compiled once.
+    (`resampling.bucket`), each of which is compiled once.
 
     **Raises:** `InputError` if no frame of one is at the time of a frame of the other,
     or the two are of different kinds.

@@ -3,19 +3,29 @@ estimate.
 
 The input is a `Case` with its prepared problem; the output are the errors against the
 truth, and the solver's status, steps and processor time.
+
+A variant is a joint problem with factors disabled or added, or variables held constant
+(`VARIANTS`).
+
+`landmark_ablation` computes the rows of `bodyslam experiment landmarks`: the effect of
+structural landmarks (appendix C). Its inputs are a `Case` and the seed of the
+perturbation; the outputs are C-ATE, m, of the perturbed cameras and after optimisation
+with and without landmarks.
 """
 
 import dataclasses
 import time
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
 
 from bodyslam_jax import graph, motion, solver
 from bodyslam_jax.config import Config, GraphWeights
-from bodyslam_jax.experiments.scenario import score_of
+from bodyslam_jax.experiments.scenario import score_of, with_scale, without_map
 from bodyslam_jax.experiments.scoring import NAMES
-from bodyslam_jax.experiments.variants import FULL, VARIANTS
 from bodyslam_jax.pipeline.case import Case
 from bodyslam_jax.pipeline.joint_problem import Prepared
 from bodyslam_jax.pipeline.solve_stage import solve_stage
@@ -39,6 +49,16 @@ PUBLISHED = "as published"
 ORDERS = ("second order", "first order, as long", "first order, 200 + 100 steps")
 _TIMED_STEPS = 20
 """Number of steps over which the time of one step is measured."""
+_SCALE_FACTORS = (
+    graph.HumanMotion,
+    graph.RootSmoothness,
+    graph.GroundContact,
+)
+"""Factors that relate the map's unit to metres."""
+Start = tuple[graph.Problem, graph.State]
+Variant = Callable[[graph.Problem, graph.State], Start]
+SHIFT_M, TURN_RAD = 0.1, 0.01
+"""The paper's bounds of the uniform perturbation of each coordinate."""
 
 
 def ablate(case: Case, prepared: Prepared, variant: str) -> dict[str, float | str]:
@@ -175,3 +195,130 @@ def _row(case, prepared, state, stage, solution=None, seconds=None):
         "seconds": float(taken),
         "cost": float(cost),
     }
+
+
+def without(*kinds: type[graph.Factor]) -> Variant:
+    """Returns the variant without these factors; s is held if no remaining factor
+    determines it.
+
+    A problem that has no such factors is returned unchanged.
+    """
+
+    def variant(problem: graph.Problem, state: graph.State) -> Start:
+        disabled = graph.disable(problem, *kinds)
+        if eqx.tree_equal(disabled, problem):
+            return problem, state
+        remaining = [f for f in problem.factors if isinstance(f, _SCALE_FACTORS)]
+        if all(isinstance(f, kinds) for f in remaining):
+            disabled = dataclasses.replace(
+                disabled, free=graph.set_constant(disabled.free, "scale")
+            )
+        return disabled, state
+
+    return variant
+
+
+def held(*names: str) -> Variant:
+    """Returns the variant that holds these groups of variables at their start
+    values."""
+
+    def variant(problem: graph.Problem, state: graph.State) -> Start:
+        free = graph.set_constant(problem.free, *names)
+        return dataclasses.replace(problem, free=free), state
+
+    return variant
+
+
+def without_landmarks(problem: graph.Problem, state: graph.State) -> Start:
+    """Returns the problem without observations of landmarks: landmarks are held, as no
+    factor determines them, and cameras are free."""
+    return held("landmarks")(
+        *without(graph.Reprojection, graph.LandmarkPrior)(problem, state)
+    )
+
+
+def with_regressed_shape(problem: graph.Problem, state: graph.State) -> Start:
+    """Returns the problem with β held at the regressor's value."""
+    (prior,) = (f for f in problem.factors if isinstance(f, graph.ShapePrior))
+    valid = jnp.isfinite(prior.sigma)
+    count = valid.sum(axis=1, dtype=prior.shape.dtype)
+    mean = jnp.where(valid, prior.shape, 0.0).sum(axis=1) / jnp.maximum(count, 1)
+    shapes = jnp.where(valid.any(axis=1), mean, state.shapes)
+    return held("shapes")(problem, dataclasses.replace(state, shapes=shapes))
+
+
+FULL = "full"
+VARIANTS: dict[str, Variant] = {
+    FULL: lambda problem, state: (problem, state),
+    "no motion model": without(graph.HumanMotion),
+    "no ground": without(graph.GroundContact),
+    "nothing that sees scale": without(
+        graph.HumanMotion, graph.RootSmoothness, graph.GroundContact
+    ),
+    "no smooth path": without(graph.RootSmoothness),
+    "no landmarks": without_landmarks,
+    "no places seen again": without(graph.LandmarkPrior),
+    "no keypoints": without(graph.KeypointReprojection),
+    "no regressed postures": without(graph.BodyPosePrior),
+    "no regressed orientation": without(graph.RootOrientation),
+    "no steady turning": without(graph.AngularAccelerationPrior),
+    "no regressed shape": without(graph.ShapePrior),
+    "β held at the regressor's": with_regressed_shape,
+    "cameras and map held": held("cameras", "landmarks"),
+}
+"""The variants of `ablation`, solved from the start of the full problem."""
+
+
+def shake(
+    state: graph.State,
+    free: graph.Step,
+    key: PRNGKeyArray,
+    *,
+    shift: float = SHIFT_M,
+    turn: float = TURN_RAD,
+) -> graph.State:
+    """Moves every camera by up to `shift` m and `turn` rad in each coordinate.
+
+    Coordinates that fix the gauge are unchanged; the state's s converts `shift` from
+    metres.
+    """
+    low, high = -jnp.ones(6), jnp.ones(6)
+    draw = jax.random.uniform(
+        key, state.cameras.shape[:1] + (6,), minval=low, maxval=high
+    )
+    size = jnp.concatenate([jnp.full(3, turn), jnp.ones(3) * shift / state.scale])
+    moved = graph.retract_pose(state.cameras, draw * size * free.cameras)
+    return graph.State(**{**vars(state), "cameras": moved})
+
+
+def landmark_ablation(case: Case, *, seed: int = 0) -> dict[str, float | str]:
+    """Returns the C-ATE, m, of the perturbed cameras, and after optimisation with and
+    without landmarks.
+
+    `original` is that of bundle adjustment in the map's own unit (the paper's first
+    column, of arbitrary scale); all others have s from the motion model.
+    """
+    prepared = case.prepare()
+    problem, state = prepared.problem, prepared.state
+    shaken = shake(state, problem.free, jax.random.key(seed))
+    bare, bare_state = without_map(problem, shaken, hold_cameras=False)
+    with_map, stage = solve_stage(problem, shaken, case.config, "joint")
+    without, stage_bare = solve_stage(bare, bare_state, case.config, "joint")
+    row: dict[str, float | str] = {
+        "status": stage["status"],
+        "status_no_landmarks": stage_bare["status"],
+        "radius": case.radius,
+    }
+    states = {
+        "original": with_scale(state, 1.0),
+        "start": state,
+        "perturbed": shaken,
+        "no_landmarks": without.state,
+        "landmarks": with_map.state,
+    }
+    for name, one in states.items():
+        found = score_of(case, one, prepared.roots.present)
+        row[name] = found["c_ate_se3"]
+        row[f"{name}/sim3"] = found["c_ate_sim3"]
+        row[f"{name}/scale"] = found["scale"]
+    return row

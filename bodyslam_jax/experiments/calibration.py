@@ -31,8 +31,7 @@ from bodyslam_jax import body as body_
 from bodyslam_jax import evaluation, io, pipeline, simulation
 from bodyslam_jax.body.skeleton import PARENTS
 from bodyslam_jax.config import Config, Experiment, Simulation
-from bodyslam_jax.experiments.jobs import COMPILATION_S, Job
-from bodyslam_jax.experiments.row_cache import Row
+from bodyslam_jax.experiments.jobs import COMPILATION_S, Job, Row
 from bodyslam_jax.experiments.tables import (
     Column,
     intro,

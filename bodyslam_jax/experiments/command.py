@@ -7,9 +7,8 @@ from pathlib import Path
 from bodyslam_jax.batch.engine import Engine, Failure, Setup
 from bodyslam_jax.config import Config, Experiment
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.experiments.jobs import Plan, check_files
+from bodyslam_jax.experiments.jobs import Journal, Plan, Row, check_files
 from bodyslam_jax.experiments.plans import PLANS
-from bodyslam_jax.experiments.row_cache import Journal, Row
 
 log = logging.getLogger(__name__)
 

@@ -16,18 +16,24 @@ from bodyslam_jax.config import Config, Experiment, Simulation
 from bodyslam_jax.experiments import ablation as ablation_
 from bodyslam_jax.experiments import reports
 from bodyslam_jax.experiments import video as video_
+from bodyslam_jax.experiments.ablation import FULL, VARIANTS, landmark_ablation
 from bodyslam_jax.experiments.calibration import jobs as calibration_jobs
 from bodyslam_jax.experiments.calibration import write_calibration
 from bodyslam_jax.experiments.comparison import compare_methods
-from bodyslam_jax.experiments.jobs import Job, Plan, by_sequence, cases, cost, named
+from bodyslam_jax.experiments.jobs import (
+    Job,
+    Plan,
+    Row,
+    by_sequence,
+    cases,
+    cost,
+    named,
+)
 from bodyslam_jax.experiments.paper import STRUCTURE
-from bodyslam_jax.experiments.provenance import about
-from bodyslam_jax.experiments.row_cache import Row
+from bodyslam_jax.experiments.reports import about
 from bodyslam_jax.experiments.scale import PERTURBATIONS, scale_recovery
 from bodyslam_jax.experiments.scenario import simulations
-from bodyslam_jax.experiments.structural_landmarks import landmark_ablation
 from bodyslam_jax.experiments.table1 import FORM, write_table1
-from bodyslam_jax.experiments.variants import FULL, VARIANTS
 from bodyslam_jax.experiments.video_table import write_video
 from bodyslam_jax.experiments.weights import (
     Learned,

@@ -1,16 +1,21 @@
 """Writes reports of the experiments on scale, landmarks, motion, ablation and weights.
 
 Inputs are finished rows; each report is written as Markdown, CSV and PNG.
+
+`about` describes the data behind a table: noise level, and settings that differ from
+the defaults.
 """
 
+import dataclasses
 import functools
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import motion
 from bodyslam_jax.config import Config, Experiment
 from bodyslam_jax.experiments import figures, paper
-from bodyslam_jax.experiments.provenance import deviations
 from bodyslam_jax.experiments.tables import (
     MM,
     Column,
@@ -20,6 +25,7 @@ from bodyslam_jax.experiments.tables import (
     write_tables,
     write_text,
 )
+from bodyslam_jax.pipeline.stage_cache import body_model_file
 
 """File of the clips that are part of the package."""
 SCALE_FORM = {
@@ -49,7 +55,7 @@ JUDGED_FORM = {
     for name in ("error", "scale", "j_ate_se3")
 }
 """Fields, with their types, that cached rows must have for the reports below, as for
-the other forms above (`row_cache.fits`)."""
+the other forms above (`jobs.fits`)."""
 
 
 def write_scale(out: Path, rows: list[Row], *, about: str) -> list[Path]:
@@ -245,3 +251,49 @@ def write_weights(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     write_text(out / "weights.csv", to_csv(columns, judged, about))
     figures.draw_learning(out / "weights.png", found, about)
     return [*files, out / "weights.png"]
+
+
+def about(experiment: Experiment, config: Config) -> str:
+    """Returns a sentence or two on simulation and settings of the rows of an
+    experiment."""
+    first = f"Simulated sequences, noise level `{experiment.noise}`."
+    return f"{first} {deviations(experiment, config)}".rstrip()
+
+
+def deviations(experiment: Experiment, config: Config) -> str:
+    """Returns text on seed, length, motion, models and settings that differ from the
+    defaults.
+
+    Settings are compared with the nearest preset. A body model that is installed on
+    this machine counts as named by the user. The text is empty if nothing differs.
+    """
+    parts = []
+    if experiment.seed is not None:
+        parts.append(f"seed {experiment.seed}")
+    if experiment.frames is not None:
+        parts.append(f"{experiment.frames} frames each")
+    if experiment.motion is not None:
+        parts.append(f"motion of `{experiment.motion}`")
+    body = body_model_file(config.body_model)
+    config = dataclasses.replace(config, body_model=None if body is None else str(body))
+    mine = dict(_flat(config))
+    against = {"default": Config(), "paper": Config.paper()}
+    differing = {
+        preset: [f"`{k}` {mine[k]}" for k, v in _flat(theirs) if mine[k] != v]
+        for preset, theirs in against.items()
+    }
+    preset = min(differing, key=lambda name: len(differing[name]))
+    parts += [f"preset `{preset}`"] if preset != "default" else []
+    parts += differing[preset]
+    return f"Not as by default: {'; '.join(parts)}." if parts else ""
+
+
+def _flat(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields every setting with its name on the command line, such as
+    `weights.pixel_sigma`."""
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from _flat(value, f"{prefix}{field.name}.")
+        else:
+            yield prefix + field.name, value

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from bodyslam_jax import graph, solver
 from bodyslam_jax.evaluation import Trajectories, evaluate_trajectories
-from bodyslam_jax.experiments.problems import with_scale, without_map
+from bodyslam_jax.experiments.scenario import with_scale, without_map
 from bodyslam_jax.pipeline.case import Case, trajectories
 
 PERTURBATIONS = (5.0, 2.0, 1.0, 0.5, 0.2, 0.1)

@@ -44,7 +44,7 @@ FORM: dict[str, Any] = {
         for name in ("truth", *_PAPER_METHODS)
     },
 }
-"""Fields of a cached row beside its sequence, and their types (`row_cache.fits`)."""
+"""Fields of a cached row beside its sequence, and their types (`jobs.fits`)."""
 _SEQUENCE_COLUMN = Column("sequence", "sequence")
 _DETAIL_COLUMNS = [
     Column("frames", "frames", digits=0),

@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator
 from bodyslam_jax.body.skeleton import head_ball
 from bodyslam_jax.diagnostics.statistics import PathStatistics
 from bodyslam_jax.evaluation.before_after import TruthBeside
-from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.types import Result
 
 # Placeholder colours, replaced by CSS variables in the SVG text.

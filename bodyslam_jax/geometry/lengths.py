@@ -2,6 +2,8 @@
 
 XLA compiles a program for each shape. Arrays over frames are therefore padded to one of
 a few lengths before they enter a compiled function, and its results are truncated.
+
+`is_traced` and `is_alone` tell concrete calls from those traced in a larger program.
 """
 
 from typing import Any
@@ -75,3 +77,13 @@ def shortened(tree: Any, frames: int, axis: int = 0) -> Any:
         return x[at] if isinstance(x, jax.core.Tracer) else put(np.asarray(x)[at])
 
     return jax.tree.map(one, tree)
+
+
+def is_alone() -> bool:
+    """Returns True if the current call is not being traced in a larger `jit`."""
+    return not isinstance(jnp.zeros(()) + 1, jax.core.Tracer)
+
+
+def is_traced(tree: Any) -> bool:
+    """Returns True if any array of a tree is a tracer (`jit`, `vmap`, `grad`)."""
+    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(tree))

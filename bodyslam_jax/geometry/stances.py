@@ -11,7 +11,7 @@ a walker accelerates by at most 3 m/s².
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.geometry.arrays import runs
 
 _MAX_STANCE_SPEED_MPS = 0.6
 """Speed below which the lower foot counts as standing, m/s: assumes that toe joints err

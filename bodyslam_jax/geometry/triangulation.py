@@ -9,7 +9,7 @@ at depth 1 (a pixel over the focal length).
 import numpy as np
 from jaxtyping import Float, Int
 
-from bodyslam_jax.geometry.grouped_sums import sum_by
+from bodyslam_jax.geometry.arrays import sum_by
 
 _MIN_DEPTH = 1e-9
 """Smallest depth that counts as in front of the camera, in the unit of the scene."""

@@ -11,41 +11,41 @@ from bodyslam_jax.graph.factor import Frame as Frame
 from bodyslam_jax.graph.factor import FrameFactor as FrameFactor
 from bodyslam_jax.graph.factor import Shared as Shared
 from bodyslam_jax.graph.factor import residual_of as residual_of
-from bodyslam_jax.graph.factors.angular_acceleration_prior import (
-    AngularAccelerationPrior as AngularAccelerationPrior,
-)
-from bodyslam_jax.graph.factors.aspect_ratio_prior import (
-    AspectRatioPrior as AspectRatioPrior,
-)
 from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior as BodyPosePrior
 from bodyslam_jax.graph.factors.camera_prior import CameraPrior as CameraPrior
+from bodyslam_jax.graph.factors.camera_prior import ScalePrior as ScalePrior
 from bodyslam_jax.graph.factors.foot_contact import FootContact as FootContact
 from bodyslam_jax.graph.factors.ground_contact import HEELS_AND_TOES as HEELS_AND_TOES
 from bodyslam_jax.graph.factors.ground_contact import GroundContact as GroundContact
 from bodyslam_jax.graph.factors.human_motion import HumanMotion as HumanMotion
+from bodyslam_jax.graph.factors.intrinsics_prior import (
+    AspectRatioPrior as AspectRatioPrior,
+)
 from bodyslam_jax.graph.factors.intrinsics_prior import (
     IntrinsicsPrior as IntrinsicsPrior,
 )
 from bodyslam_jax.graph.factors.keypoint_reprojection import (
     KeypointReprojection as KeypointReprojection,
 )
-from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior as LandmarkPrior
 from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior as MarginalPrior
-from bodyslam_jax.graph.factors.relative_orientation import (
+from bodyslam_jax.graph.factors.reprojection import LandmarkPrior as LandmarkPrior
+from bodyslam_jax.graph.factors.reprojection import Reprojection as Reprojection
+from bodyslam_jax.graph.factors.root_orientation import (
     RelativeOrientation as RelativeOrientation,
 )
-from bodyslam_jax.graph.factors.reprojection import Reprojection as Reprojection
 from bodyslam_jax.graph.factors.root_orientation import (
     RootOrientation as RootOrientation,
 )
+from bodyslam_jax.graph.factors.root_orientation import UprightPrior as UprightPrior
 from bodyslam_jax.graph.factors.root_position_prior import (
     RootPositionPrior as RootPositionPrior,
 )
+from bodyslam_jax.graph.factors.root_smoothness import (
+    AngularAccelerationPrior as AngularAccelerationPrior,
+)
 from bodyslam_jax.graph.factors.root_smoothness import RootSmoothness as RootSmoothness
-from bodyslam_jax.graph.factors.scale_prior import ScalePrior as ScalePrior
 from bodyslam_jax.graph.factors.shape_prior import ShapePrior as ShapePrior
-from bodyslam_jax.graph.factors.stature import Stature as Stature
-from bodyslam_jax.graph.factors.upright_prior import UprightPrior as UprightPrior
+from bodyslam_jax.graph.factors.shape_prior import Stature as Stature
 from bodyslam_jax.graph.globals import GlobalPrior as GlobalPrior
 from bodyslam_jax.graph.globals import Variable as Variable
 from bodyslam_jax.graph.layout import Layout as Layout
@@ -55,8 +55,10 @@ from bodyslam_jax.graph.losses import Cauchy as Cauchy
 from bodyslam_jax.graph.losses import GemanMcClure as GemanMcClure
 from bodyslam_jax.graph.losses import Loss as Loss
 from bodyslam_jax.graph.losses import Squared as Squared
+from bodyslam_jax.graph.losses import ar1_correlation as ar1_correlation
 from bodyslam_jax.graph.losses import robustify as robustify
 from bodyslam_jax.graph.losses import squared_norm as squared_norm
+from bodyslam_jax.graph.losses import whitening_of as whitening_of
 from bodyslam_jax.graph.ordering import CHUNK as CHUNK
 from bodyslam_jax.graph.padding import extend as extend
 from bodyslam_jax.graph.padding import extend_state as extend_state
@@ -78,5 +80,3 @@ from bodyslam_jax.graph.state import world_from_root as world_from_root
 from bodyslam_jax.graph.validation import check_state as check_state
 from bodyslam_jax.graph.weights import weights as weights
 from bodyslam_jax.graph.weights import with_weights as with_weights
-from bodyslam_jax.graph.whitening import ar1_correlation as ar1_correlation
-from bodyslam_jax.graph.whitening import whitening_of as whitening_of

@@ -8,15 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from bodyslam_jax.geometry.lengths import is_traced
 from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.factors.intrinsics_prior import AbstractIntrinsicsFactor
-from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
 from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior
-from bodyslam_jax.graph.factors.reprojection import Reprojection
+from bodyslam_jax.graph.factors.reprojection import LandmarkPrior, Reprojection
 from bodyslam_jax.graph.padding import Masked
 from bodyslam_jax.graph.problem import Problem
 from bodyslam_jax.graph.state import State, Step, moved_at_random
-from bodyslam_jax.graph.tracing import is_traced
 
 _RESIDUAL_RTOL = {"float64": 1e-9, "float32": 1e-4}
 """Largest relative difference of a residual in two units of the map, by precision."""

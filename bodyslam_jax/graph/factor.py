@@ -5,24 +5,27 @@ A residual is prediction minus measurement in standard deviations, so that
 `sigma = inf` and a finite value. A factor over frames is written for one frame of one
 person (`frame_residual`), with the variables it depends on (`keys`); the residuals of
 all frames and the blocks of the Jacobian follow from that.
+
+The array fields of a module and the axes that their jaxtyping annotations name.
 """
 
 import abc
+import dataclasses
+import functools
+import typing
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import AbstractArray, Array, Float, Int
 
-from bodyslam_jax.graph.annotations import fields_with_axes
 from bodyslam_jax.graph.losses import Loss, Squared, squared_norm
 from bodyslam_jax.graph.state import State
 
 Key = tuple[str, int]
 """A variable and its lag in frames: `("camera", 1)` is the previous camera."""
-
 _PERSON_VARIABLES = ("root", "pose", "shape")
 _SHARED_VARIABLES = ("scale", "shape", "intrinsics", "globals")
 BUILT_IN_VARIABLES = ("camera", "root", "pose", *_SHARED_VARIABLES)
@@ -311,3 +314,31 @@ class FrameFactor(Factor):
 
     def residual(self, state: State) -> Float[Array, "*m d"]:
         return self.map_frames(lambda d, w, s, _: self.frame_residual(d, w, s), state)
+
+
+@functools.cache
+def array_annotations(kind: type[eqx.Module]) -> dict[str, type[AbstractArray]]:
+    """Returns the fields annotated with a jaxtyping array, in their declared order.
+
+    Annotations that are strings (`from __future__ import annotations`) are evaluated.
+    """
+    fields = dataclasses.fields(kind)
+    if any(isinstance(field.type, str) for field in fields):
+        types: dict[str, Any] = typing.get_type_hints(kind)
+    else:
+        types = {field.name: field.type for field in fields}
+    return {
+        field.name: types[field.name]
+        for field in fields
+        if isinstance(types[field.name], type)
+        and issubclass(types[field.name], AbstractArray)
+    }
+
+
+def fields_with_axes(kind: type[eqx.Module], axes: tuple[str, ...]) -> tuple[str, ...]:
+    """Returns the array fields whose leading axes are these, such as `("h", "t")`."""
+    return tuple(
+        name
+        for name, array in array_annotations(kind).items()
+        if tuple(array.dim_str.split()[: len(axes)]) == axes
+    )

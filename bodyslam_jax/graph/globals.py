@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from bodyslam_jax.geometry.lengths import is_traced
 from bodyslam_jax.graph.factor import BUILT_IN_VARIABLES, Factor, FrameFactor, Key
 from bodyslam_jax.graph.losses import Loss, Squared
-from bodyslam_jax.graph.tracing import is_traced
 
 Named = tuple[tuple[str, int], ...]
 """Names and sizes of globals, in the order of `State.globals`."""

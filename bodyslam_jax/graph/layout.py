@@ -21,8 +21,12 @@ from jaxtyping import Array, Int
 
 from bodyslam_jax.geometry.lengths import put, round_up
 from bodyslam_jax.graph import sizes
-from bodyslam_jax.graph.long_tracks import choose_long_tracks
-from bodyslam_jax.graph.ordering import CHUNK, PERSON_COORDINATES, order_chunks
+from bodyslam_jax.graph.ordering import (
+    CHUNK,
+    PERSON_COORDINATES,
+    choose_long_tracks,
+    order_chunks,
+)
 
 _WIDTHS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128, 192, 256, 512)
 _GROUP_LANDMARKS = 24
@@ -43,7 +47,7 @@ class Bucket(eqx.Module):
     width: int = eqx.field(static=True)
     lasting: bool = eqx.field(static=True, default=False)
     """Whether its landmarks have long tracks, and are eliminated with the globals
-    (`long_tracks.py`)."""
+    (`ordering.py`)."""
     used: Int[Array, ""] | None = None
     """Number of groups that hold landmarks, the first ones; `None` for all."""
 

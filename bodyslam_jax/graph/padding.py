@@ -16,12 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from bodyslam_jax.geometry.lengths import put
-from bodyslam_jax.graph.annotations import array_annotations
-from bodyslam_jax.graph.factor import FrameFactor
+from bodyslam_jax.geometry.lengths import is_traced, put
+from bodyslam_jax.graph.factor import FrameFactor, array_annotations
 from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State, moved_at_random
-from bodyslam_jax.graph.tracing import is_traced
 
 _COST_RTOL = {"float64": 1e-8, "float32": 1e-3}
 """Allowed relative difference of costs, by precision."""

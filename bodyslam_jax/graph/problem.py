@@ -13,14 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from bodyslam_jax.geometry.lengths import LENGTHS
+from bodyslam_jax.geometry.lengths import LENGTHS, is_traced
 from bodyslam_jax.graph.factor import Factor, FrameFactor
 from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
 from bodyslam_jax.graph.factors.human_motion import HumanMotion
-from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
 from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior
-from bodyslam_jax.graph.factors.relative_orientation import RelativeOrientation
-from bodyslam_jax.graph.factors.reprojection import Reprojection
+from bodyslam_jax.graph.factors.reprojection import LandmarkPrior, Reprojection
+from bodyslam_jax.graph.factors.root_orientation import RelativeOrientation
 from bodyslam_jax.graph.globals import (
     GlobalPrior,
     Named,
@@ -35,17 +34,16 @@ from bodyslam_jax.graph.layout import (
     layouts_of_one_size,
     make_layout,
 )
-from bodyslam_jax.graph.memory import check_memory
 from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.padding import Masked, check_padding, extend
 from bodyslam_jax.graph.sizes import CHUNK_LANDMARKS, is_dense
 from bodyslam_jax.graph.state import TURNS, State, Step, gauge
 from bodyslam_jax.graph.terms import TermCosts, names_of_terms
-from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation import (
     Sizes,
     check_basis,
     check_measurements,
+    check_memory,
     check_prior,
     check_shapes,
     check_state,

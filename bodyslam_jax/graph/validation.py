@@ -3,8 +3,12 @@
 Shapes must match the fields' annotations, where `t` frames, `h` people, `l` landmarks
 and `i` intrinsics are those of the state. Shapes and dtypes are checked under `jit` and
 `vmap` too; values only where they are not traced.
+
+Problems that do not fit into memory are refused before the solver is started.
 """
 
+import os
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -14,19 +18,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from bodyslam_jax.body import KEYPOINT_NAMES
-from bodyslam_jax.graph.annotations import array_annotations
-from bodyslam_jax.graph.factor import Factor, FrameFactor
+from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.geometry.lengths import LENGTHS, is_traced
+from bodyslam_jax.graph.factor import Factor, FrameFactor, array_annotations
 from bodyslam_jax.graph.factors.camera_prior import CameraPrior
 from bodyslam_jax.graph.factors.ground_contact import GroundContact
 from bodyslam_jax.graph.factors.keypoint_reprojection import KeypointReprojection
-from bodyslam_jax.graph.factors.landmark_prior import LandmarkPrior
 from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior
-from bodyslam_jax.graph.factors.reprojection import Reprojection
-from bodyslam_jax.graph.factors.root_orientation import RootOrientation
+from bodyslam_jax.graph.factors.reprojection import LandmarkPrior, Reprojection
+from bodyslam_jax.graph.factors.root_orientation import RootOrientation, UprightPrior
 from bodyslam_jax.graph.factors.root_position_prior import RootPositionPrior
-from bodyslam_jax.graph.factors.upright_prior import UprightPrior
+from bodyslam_jax.graph.layout import Layout
+from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.state import TURNS, State, Step
-from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.graph.validation_weights import (
     check_correlation,
     check_first_frames,
@@ -35,7 +39,6 @@ from bodyslam_jax.graph.validation_weights import (
 
 Sizes = dict[str, int]
 """Lengths of the axes that annotations name."""
-
 _MAX_ROTATION_ERROR = 1e-3
 """Largest allowed entry of `|C^T C - I|`: files have few digits, and rotations drift in
 single precision."""
@@ -44,6 +47,11 @@ _DTYPE_KINDS: dict[Any, tuple[Any, str]] = {
     Int: (jnp.integer, "integers"),
     Bool: (jnp.bool_, "bool"),
 }
+_CGROUP_LIMIT_FILES = (
+    "/sys/fs/cgroup/memory.max",
+    "/sys/fs/cgroup/memory/memory.limit_in_bytes",
+)
+"""Memory limit of a container (cgroup v2, v1); `max`, or a huge number, without."""
 
 
 def check_state(state: State, free: Step | None = None) -> Sizes:
@@ -324,3 +332,44 @@ def check_basis(basis: Array | np.ndarray, dtype: np.dtype) -> Array:
             "qr` makes them so."
         )
     return jnp.asarray(found, dtype)
+
+
+def memory() -> int:
+    """Returns the bytes of memory of this machine, or of its container's limit."""
+    found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    for name in _CGROUP_LIMIT_FILES:
+        try:
+            found.append(int(Path(name).read_text()))
+        except (OSError, ValueError):
+            continue
+    return min(found)
+
+
+def memory_needed(layout: Layout, state: State, pose: int) -> int:
+    """Estimates the bytes of the solver's tables for postures of `pose` coordinates."""
+    item = state.scale.dtype.itemsize
+    people = len(state.roots)
+    person = pose + 12  # what remains of a chunk: a posture and two roots
+    front = CHUNK * 6 * layout.bandwidth + people * (layout.reach * person + 10) + 16
+    front += 3 * layout.lasting
+    pivot = 6 * CHUNK + people * person
+    window = 2 * person + 6 * CHUNK + 24
+    postures = CHUNK * 4 * pose * (2 * pose + 6 * CHUNK + 12)
+    chunk = 3 * pivot * front + people * (window**2 + postures)
+    tables = sum(40 * bucket.row.size for bucket in layout.buckets)
+    return item * (chunk * layout.num_chunks + tables)
+
+
+def check_memory(layout: Layout, state: State, pose: int) -> None:
+    """Refuses a problem that does not fit; memory grows linearly with frames.
+
+    **Raises:** `InputError` with the number of frames that fit.
+    """
+    need, have = memory_needed(layout, state, pose), memory()
+    if need > have:
+        most = int(layout.num_chunks * CHUNK * have / need)
+        fit = max((x for x in LENGTHS if x <= most), default=most)
+        raise InputError(
+            f"{len(state.cameras)} frames need about {need / 2**30:.1f} GiB, found "
+            f"{have / 2**30:.1f} GiB: about {fit} frames fit."
+        )

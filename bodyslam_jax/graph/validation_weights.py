@@ -8,20 +8,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bodyslam_jax.geometry.lengths import is_traced
 from bodyslam_jax.graph.factor import Factor
-from bodyslam_jax.graph.factors.angular_acceleration_prior import (
-    AngularAccelerationPrior,
-)
 from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
 from bodyslam_jax.graph.factors.foot_contact import FootContact
 from bodyslam_jax.graph.factors.human_motion import HumanMotion
-from bodyslam_jax.graph.factors.relative_orientation import RelativeOrientation
-from bodyslam_jax.graph.factors.root_orientation import RootOrientation
+from bodyslam_jax.graph.factors.root_orientation import (
+    RelativeOrientation,
+    RootOrientation,
+)
 from bodyslam_jax.graph.factors.root_position_prior import RootPositionPrior
-from bodyslam_jax.graph.factors.root_smoothness import RootSmoothness
+from bodyslam_jax.graph.factors.root_smoothness import (
+    AngularAccelerationPrior,
+    RootSmoothness,
+)
 from bodyslam_jax.graph.losses import Loss
 from bodyslam_jax.graph.state import State, Step
-from bodyslam_jax.graph.tracing import is_traced
 
 _FIRST_FRAMES = (
     (HumanMotion, "whitening", 1, 0.0),

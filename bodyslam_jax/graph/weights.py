@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from bodyslam_jax.geometry.lengths import is_traced
 from bodyslam_jax.graph.factor import Factor
 from bodyslam_jax.graph.padding import Masked
 from bodyslam_jax.graph.problem import Problem
 from bodyslam_jax.graph.terms import name_of_term
-from bodyslam_jax.graph.tracing import is_traced
 
 
 def weights(problem: Problem) -> dict[str, Float[Array, ""]]:

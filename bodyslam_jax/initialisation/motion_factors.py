@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float
 from bodyslam_jax import graph, motion
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import GraphWeights
+from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.geometry.lengths import lengthened, padded_length, shortened
-from bodyslam_jax.geometry.runs import runs
 
 _STRIDE_S = 1.0
 """Duration of a stride (two steps) in walking, s."""

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from bodyslam_jax.io.bodies.formats.amass import write_body as write_body
-    from bodyslam_jax.io.camera.tum import read_tum as read_tum
-    from bodyslam_jax.io.camera.tum import write_tum as write_tum
+    from bodyslam_jax.io.camera.path import read_tum as read_tum
+    from bodyslam_jax.io.camera.path import write_tum as write_tum
     from bodyslam_jax.io.detected import with_detections as with_detections
     from bodyslam_jax.io.sequence import read_sequence as read_sequence
     from bodyslam_jax.io.video import frames as frames
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 _HOME = {
     "frames": "video",
     "read_sequence": "sequence",
-    "read_tum": "camera.tum",
+    "read_tum": "camera.path",
     "with_detections": "detected",
     "write_body": "bodies.formats.amass",
-    "write_tum": "camera.tum",
+    "write_tum": "camera.path",
 }
 __all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 

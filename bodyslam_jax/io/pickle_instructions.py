@@ -7,17 +7,13 @@ import codecs
 import re
 import struct
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from bodyslam_jax.io.pickle_machine import Instruction, Machine
 from bodyslam_jax.io.pickle_values import BLOB_BYTES, OBJECT_BYTES, Blob
 from bodyslam_jax.io.plain_arrays import VALUE_BYTES, Damaged, Refused, shown
-
-if TYPE_CHECKING:
-    from bodyslam_jax.io.pickle_machine import Machine
-
-Instruction = Callable[["Machine"], None]
 
 
 def _whole(value: int) -> int:
@@ -39,7 +35,7 @@ def _constant(value: Any) -> Instruction:
 def _long(layout: str) -> Instruction:
     width = struct.Struct(layout)
 
-    def step(machine: "Machine") -> None:
+    def step(machine: Machine) -> None:
         count = machine.number(width)
         if not 0 <= count <= 9:
             raise Refused("a whole number of more than 64 bits")
@@ -49,7 +45,7 @@ def _long(layout: str) -> Instruction:
     return step
 
 
-def _written_int(machine: "Machine") -> None:
+def _written_int(machine: Machine) -> None:
     text = machine.line()
     if text in (b"00", b"01"):
         return machine.push(text == b"01")
@@ -58,14 +54,14 @@ def _written_int(machine: "Machine") -> None:
     machine.push(_whole(int(text.rstrip(b"L"))))
 
 
-def _written_float(machine: "Machine") -> None:
+def _written_float(machine: Machine) -> None:
     text = machine.line()
     if not re.fullmatch(rb"[+-]?(\d+\.?\d*|\.\d+|inf|nan)(e[+-]?\d+)?", text.lower()):
         raise Damaged(f"{text[:40]!r} as a number")
     machine.push(float(text))
 
 
-def _written_string(machine: "Machine") -> None:
+def _written_string(machine: Machine) -> None:
     """Pushes a text of Python 2, in quotes."""
     text = machine.line(len(machine.data))
     if len(text) < 2 or text[:1] not in b"'\"" or text[:1] != text[-1:]:
@@ -75,7 +71,7 @@ def _written_string(machine: "Machine") -> None:
     machine.push(plain.decode("latin1"))
 
 
-def _written_unicode(machine: "Machine") -> None:
+def _written_unicode(machine: Machine) -> None:
     line = machine.line(len(machine.data))
     machine.account.spend(4 * len(line))
     text = line.decode("raw-unicode-escape")
@@ -89,7 +85,7 @@ def _sized(layout: str, kind: type, is_text: bool = False) -> Instruction:
     length."""
     width = struct.Struct(layout)
 
-    def step(machine: "Machine") -> None:
+    def step(machine: Machine) -> None:
         count = machine.number(width)
         if count < 0:
             raise Damaged(f"a text of {count} characters")
@@ -108,7 +104,7 @@ def _sized(layout: str, kind: type, is_text: bool = False) -> Instruction:
 
 
 def _tuple_of(count: int) -> Instruction:
-    def step(machine: "Machine") -> None:
+    def step(machine: Machine) -> None:
         if len(machine.stack) < count:
             raise Damaged("a tuple of more objects than there are")
         items = tuple(machine.stack[len(machine.stack) - count :])
@@ -118,17 +114,17 @@ def _tuple_of(count: int) -> Instruction:
     return step
 
 
-def _of_marked(make: Callable[["Machine", list], Any]) -> Instruction:
+def _of_marked(make: Callable[[Machine, list], Any]) -> Instruction:
     """Returns the instruction that pushes a container of all objects above the mark."""
 
-    def step(machine: "Machine") -> None:
+    def step(machine: Machine) -> None:
         items = machine.pop_mark()
         machine.push(make(machine, items), OBJECT_BYTES + 8 * len(items))
 
     return step
 
 
-def _marked_dict(machine: "Machine", items: list) -> dict:
+def _marked_dict(machine: Machine, items: list) -> dict:
     found: dict[Any, Any] = {}
     machine.set_items(found, items)
     return found
@@ -138,44 +134,44 @@ def _empty(make: Callable[[], Any]) -> Instruction:
     return lambda machine: machine.push(make(), OBJECT_BYTES)
 
 
-def _mark(machine: "Machine") -> None:
+def _mark(machine: Machine) -> None:
     machine.account.spend(2 * VALUE_BYTES)
     machine.marked.append(machine.stack)
     machine.stack = []
 
 
-def _pop(machine: "Machine") -> None:
+def _pop(machine: Machine) -> None:
     if machine.stack:
         machine.stack.pop()
     else:
         machine.pop_mark()
 
 
-def _pop_mark(machine: "Machine") -> None:
+def _pop_mark(machine: Machine) -> None:
     machine.pop_mark()
 
 
-def _append(machine: "Machine") -> None:
+def _append(machine: Machine) -> None:
     item = machine.stack.pop()
     machine.extend(machine.stack[-1], [item])
 
 
-def _appends(machine: "Machine") -> None:
+def _appends(machine: Machine) -> None:
     items = machine.pop_mark()
     machine.extend(machine.stack[-1], items)
 
 
-def _set_item(machine: "Machine") -> None:
+def _set_item(machine: Machine) -> None:
     value, key = machine.stack.pop(), machine.stack.pop()
     machine.set_items(machine.stack[-1], [key, value])
 
 
-def _set_items(machine: "Machine") -> None:
+def _set_items(machine: Machine) -> None:
     items = machine.pop_mark()
     machine.set_items(machine.stack[-1], items)
 
 
-def _add_items(machine: "Machine") -> None:
+def _add_items(machine: Machine) -> None:
     items, target = machine.pop_mark(), machine.stack[-1]
     if type(target) is not set:
         raise Refused(f"it wants to change {shown(target)}")
@@ -192,71 +188,70 @@ def _get(layout: str) -> Instruction:
     return lambda machine: machine.push(machine.memo[machine.number(place)], 8)
 
 
-def _place(machine: "Machine") -> int:
+def _place(machine: Machine) -> int:
     text = machine.line()
     if not re.fullmatch(rb"\d{1,10}", text):
         raise Damaged(f"{text[:40]!r} as a number of an object")
     return int(text)
 
 
-def _global(machine: "Machine") -> None:
+def _global(machine: Machine) -> None:
     module, name = machine.line().decode(), machine.line().decode()
     machine.push(machine.named(module, name), 8)
 
 
-def _stack_global(machine: "Machine") -> None:
+def _stack_global(machine: Machine) -> None:
     name, module = machine.stack.pop(), machine.stack.pop()
     machine.push(machine.named(module, name), 8)
 
 
-def _reduce(machine: "Machine") -> None:
+def _reduce(machine: Machine) -> None:
     arguments, function = machine.stack.pop(), machine.stack.pop()
     machine.call(function, arguments)
 
 
-def _new_with_names(machine: "Machine") -> None:
+def _new_with_names(machine: Machine) -> None:
     named = machine.stack.pop()
     if named != {}:
         raise Refused("it wants to make an object with named arguments")
     _reduce(machine)
 
 
-def _instance(machine: "Machine") -> None:
+def _instance(machine: Machine) -> None:
     """Pushes an object of an old class of Python 2, by its name."""
     of = machine.named(machine.line().decode(), machine.line().decode())
     machine.call(of, tuple(machine.pop_mark()))
 
 
-def _object(machine: "Machine") -> None:
+def _object(machine: Machine) -> None:
     items = machine.pop_mark()
     machine.call(items[0], tuple(items[1:]))
 
 
-def _reference(machine: "Machine") -> None:
+def _reference(machine: Machine) -> None:
     pid = machine.stack.pop()
     if machine.persistent is None:
         raise Refused("it refers to data outside the file")
     machine.push(machine.persistent(pid), OBJECT_BYTES)
 
 
-def _outside(_: "Machine") -> None:
+def _outside(_: Machine) -> None:
     raise Refused("it refers to data outside the file")
 
 
-def _protocol(machine: "Machine") -> None:
+def _protocol(machine: Machine) -> None:
     (version,) = machine.bytes_at(1)
     if version > 5:
         raise Refused(f"a pickle of protocol {version}, expected 0 to 5")
 
 
-def _frame(machine: "Machine") -> None:
+def _frame(machine: Machine) -> None:
     """Checks the length of a frame, which only readers in parts need."""
     length = machine.number(struct.Struct("<Q"))
     if length > len(machine.data) - machine.at:
         raise Damaged(f"{length} bytes, {len(machine.data) - machine.at} are there")
 
 
-STOP = ord(".")
 STEPS: dict[int, Instruction] = {
     ord(code): step
     for code, step in {

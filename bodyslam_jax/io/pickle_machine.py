@@ -7,19 +7,18 @@ and types, joblib's arrays, PyTorch's tensors. No object of a library is made by
 the program says: an array is made here, once its type, shape and bytes agree. What the
 program makes, how deep, and in how many instructions is bounded.
 
-The machine has the stack, the names and the account of what is made; its instructions
-are in `pickle_instructions`.
+The machine has the stack, the names and the account of what is made. Its subclass in
+`safe_pickle` has the instructions (`pickle_instructions`) and what stands for names
+(`pickle_names`).
 """
 
 import struct
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
 from bodyslam_jax.io import plain_arrays
-from bodyslam_jax.io.pickle_instructions import STEPS, STOP
-from bodyslam_jax.io.pickle_names import CALLS, INERT, set_type
 from bodyslam_jax.io.pickle_values import (
     OBJECT_BYTES,
     ArrayToFill,
@@ -49,6 +48,9 @@ MAX_COLLISIONS = 100
 intent."""
 
 Persistent = Callable[[Any], Any]
+Instruction = Callable[["Machine"], None]
+STOP = ord(".")
+"""The instruction that ends a pickle."""
 
 
 class Machine:
@@ -60,6 +62,14 @@ class Machine:
         stand_ins: packages whose objects become `StandIn`s.
         persistent: what stands for a reference to data outside the pickle.
     """
+
+    instructions: ClassVar[Mapping[int, Instruction]] = {}
+    """What each instruction does, by its code (`pickle_instructions`)."""
+    calls: ClassVar[Mapping[str, Callable[..., Any]]] = {}
+    """What stands for the functions and classes that a pickle may call
+    (`pickle_names`)."""
+    inert: ClassVar[Collection[str]] = ()
+    """Names that a pickle may hold, but not call."""
 
     def __init__(
         self,
@@ -98,7 +108,7 @@ class Machine:
             account.steps -= 1
             if account.steps < 0:
                 raise Refused("more instructions than its size on disk accounts for")
-            step = STEPS.get(code)
+            step = self.instructions.get(code)
             if step is None:
                 raise Damaged(f"{bytes([code])!r} is no instruction of a pickle")
             step(self)
@@ -151,7 +161,7 @@ class Machine:
         root = {"__builtin__": "builtins", "copy_reg": "copyreg"}.get(root, root)
         key = ".".join([root, rest, name] if rest else [root, name])
         key = key.replace("numpy._core.", "numpy.core.")
-        if key in CALLS or key in INERT:
+        if key in self.calls or key in self.inert:
             found = Name(key)
         elif any(f"{module}.".startswith(f"{package}.") for package in self.stand_ins):
             self.account.spend(OBJECT_BYTES + len(key))
@@ -167,7 +177,7 @@ class Machine:
             raise Refused(f"it wants to call {shown(function)}")
         if function.is_stand_in:
             return self.push(StandIn(function.key), 2 * OBJECT_BYTES)
-        make = CALLS.get(function.key)
+        make = self.calls.get(function.key)
         if make is None:
             raise Refused(f"it wants to call {function.key}")
         self.push(make(self, *arguments), OBJECT_BYTES)
@@ -270,7 +280,7 @@ class Machine:
         if not isinstance(of, ArrayType) or order not in ("C", "F"):
             raise Refused("an array of joblib's without order and type")
         if of.kind == "O":
-            inner = Machine(
+            inner = type(self)(
                 self.data, self.at, self.account, self.stand_ins, level=self.level + 1
             )
             found = inner.load()
@@ -280,3 +290,26 @@ class Machine:
             self.bytes_at(self.bytes_at(1)[0])
         content = self.bytes_at(plain_arrays.num_bytes(of, shape, self.account))
         return plain_arrays.array_of(content, of, shape, self.account, order == "F")
+
+
+def set_type(of: ArrayType, state: Any) -> None:
+    """Sets a type as `numpy.dtype.__setstate__` would: only the order of bytes may
+    change.
+
+    The state is (version, order, subtype, names, fields, item size, alignment, flags).
+    """
+    if type(state) is not tuple or len(state) not in (8, 9):
+        raise Refused("an array's type with an unknown state")
+    version, order, subtype, names, fields, size, alignment, flags, *metadata = state
+    known = (
+        version in (3, 4)
+        and order in ("<", ">", "|", "=")
+        and subtype is names is fields is None
+        and metadata in ([], [None])
+        and size in (-1, of.size)
+        and alignment in (-1, 1, 2, 4, 8)
+        and flags in {"O": (63,), "U": (8, 0)}.get(of.kind, (0,))
+    )
+    if not known:
+        raise Refused("an array's type with fields, flags or sizes of its own")
+    of.order = ">" if order == ">" else "<"

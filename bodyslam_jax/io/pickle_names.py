@@ -6,11 +6,12 @@ tensors are described by the pickle; what it says is checked, and the array is m
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bodyslam_jax.io import plain_arrays
+from bodyslam_jax.io.pickle_machine import Machine
 from bodyslam_jax.io.pickle_values import (
     ArrayToFill,
     Blob,
@@ -21,44 +22,18 @@ from bodyslam_jax.io.pickle_values import (
 )
 from bodyslam_jax.io.plain_arrays import VALUE_BYTES, ArrayType, Refused, shown
 
-if TYPE_CHECKING:
-    from bodyslam_jax.io.pickle_machine import Machine
-
 MAX_REPEATED_BYTES = 16_000_000
 """Largest size of a tensor that repeats its numbers, bytes: ten β for each of 400,000
 frames."""
 
 
-def set_type(of: ArrayType, state: Any) -> None:
-    """Sets a type as `numpy.dtype.__setstate__` would: only the order of bytes may
-    change.
-
-    The state is (version, order, subtype, names, fields, item size, alignment, flags).
-    """
-    if type(state) is not tuple or len(state) not in (8, 9):
-        raise Refused("an array's type with an unknown state")
-    version, order, subtype, names, fields, size, alignment, flags, *metadata = state
-    known = (
-        version in (3, 4)
-        and order in ("<", ">", "|", "=")
-        and subtype is names is fields is None
-        and metadata in ([], [None])
-        and size in (-1, of.size)
-        and alignment in (-1, 1, 2, 4, 8)
-        and flags in {"O": (63,), "U": (8, 0)}.get(of.kind, (0,))
-    )
-    if not known:
-        raise Refused("an array's type with fields, flags or sizes of its own")
-    of.order = ">" if order == ">" else "<"
-
-
-def _type(_: "Machine", code: Any = None, *flags: Any) -> ArrayType:
+def _type(_: Machine, code: Any = None, *flags: Any) -> ArrayType:
     if len(flags) > 2 or any(type(flag) not in (bool, int) for flag in flags):
         raise Refused("an array's type with fields, flags or sizes of its own")
     return plain_arrays.array_type(code)
 
 
-def _reconstruct(_: "Machine", kind: Any, shape: Any, code: Any) -> ArrayToFill:
+def _reconstruct(_: Machine, kind: Any, shape: Any, code: Any) -> ArrayToFill:
     """Returns an empty array, whose state follows; shape and type given here are not
     used."""
     if kind != Name("numpy.ndarray"):
@@ -67,7 +42,7 @@ def _reconstruct(_: "Machine", kind: Any, shape: Any, code: Any) -> ArrayToFill:
 
 
 def _from_buffer(
-    machine: "Machine",
+    machine: Machine,
     content: Any,
     of: Any,
     shape: Any,
@@ -86,15 +61,15 @@ def _from_buffer(
     return np.ascontiguousarray(array.transpose(axes))
 
 
-def _scalar(machine: "Machine", of: Any, content: Any = b"") -> Any:
+def _scalar(machine: Machine, of: Any, content: Any = b"") -> Any:
     return machine.array(content, of, ()).item()
 
 
-def _joblib(_: "Machine", *arguments: Any) -> JoblibArray:
+def _joblib(_: Machine, *arguments: Any) -> JoblibArray:
     return JoblibArray()
 
 
-def _encode(machine: "Machine", text: Any, encoding: Any = "latin1") -> bytes:
+def _encode(machine: Machine, text: Any, encoding: Any = "latin1") -> bytes:
     """Returns bytes as protocols up to 2 hold them."""
     if type(text) is not str or encoding not in ("latin1", "latin-1"):
         raise Refused(f"{shown(text)} in the encoding {shown(encoding)}")
@@ -102,7 +77,7 @@ def _encode(machine: "Machine", text: Any, encoding: Any = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-def _dict(machine: "Machine", *arguments: Any) -> dict:
+def _dict(machine: Machine, *arguments: Any) -> dict:
     """Returns a dictionary, ordered or not, of pairs."""
     pairs = arguments[0] if arguments else []
     if len(arguments) > 1 or type(pairs) not in (list, tuple):
@@ -115,13 +90,13 @@ def _dict(machine: "Machine", *arguments: Any) -> dict:
     return found
 
 
-def _default_dict(machine: "Machine", *arguments: Any) -> dict:
+def _default_dict(machine: Machine, *arguments: Any) -> dict:
     """Returns a dictionary, without the default for missing keys."""
     return _dict(machine, *arguments[1:])
 
 
 def _sequence(make: Callable[[Any], Any]) -> Callable[..., Any]:
-    def made(machine: "Machine", items: Any = (), *more: Any) -> Any:
+    def made(machine: Machine, items: Any = (), *more: Any) -> Any:
         if type(items) not in (list, tuple):
             raise Refused(f"a sequence of {shown(items)}")
         machine.account.spend(VALUE_BYTES * len(items))
@@ -130,42 +105,42 @@ def _sequence(make: Callable[[Any], Any]) -> Callable[..., Any]:
     return made
 
 
-def _set(machine: "Machine", items: Any = ()) -> set:
+def _set(machine: Machine, items: Any = ()) -> set:
     if type(items) not in (list, tuple):
         raise Refused(f"a set of {shown(items)}")
     return machine.set_of(items)
 
 
-def _bytes(machine: "Machine", content: Any = b"") -> bytes | Blob:
+def _bytes(machine: Machine, content: Any = b"") -> bytes | Blob:
     if type(content) is bytes or isinstance(content, Blob):
         return content
     raise Refused(f"bytes of {shown(content)}")
 
 
-def _number(machine: "Machine", value: Any = 0) -> int | float:
+def _number(machine: Machine, value: Any = 0) -> int | float:
     if type(value) in (int, float, bool):
         return value
     raise Refused(f"a number of {shown(value)}")
 
 
-def _complex(machine: "Machine", real: Any, imaginary: Any) -> complex:
+def _complex(machine: Machine, real: Any, imaginary: Any) -> complex:
     return complex(_number(machine, real), _number(machine, imaginary))
 
 
-def _slice(machine: "Machine", *limits: Any) -> slice:
+def _slice(machine: Machine, *limits: Any) -> slice:
     if len(limits) != 3 or any(type(n) not in (int, type(None)) for n in limits):
         raise Refused("a slice of other things than whole numbers")
     return slice(*limits)
 
 
-def _path(machine: "Machine", *parts: Any) -> str:
+def _path(machine: Machine, *parts: Any) -> str:
     if not all(type(part) is str for part in parts):
         raise Refused("a path of other things than text")
     machine.account.spend(sum(len(part) + 1 for part in parts))
     return "/".join(parts)
 
 
-def _reconstructor(machine: "Machine", of: Any, base: Any, state: Any) -> StandIn:
+def _reconstructor(machine: Machine, of: Any, base: Any, state: Any) -> StandIn:
     """Returns an instance of a new-style class, as Python 2 pickles it."""
     if isinstance(of, Name) and of.is_stand_in and base == Name("builtins.object"):
         return StandIn(of.key)
@@ -173,7 +148,7 @@ def _reconstructor(machine: "Machine", of: Any, base: Any, state: Any) -> StandI
 
 
 def _tensor(
-    machine: "Machine", storage: Any, offset: Any, size: Any, stride: Any, *_: Any
+    machine: Machine, storage: Any, offset: Any, size: Any, stride: Any, *_: Any
 ) -> np.ndarray:
     """Returns a copy of a strided view, checked to lie within its storage."""
     if not isinstance(storage, Storage) or type(offset) is not int or offset < 0:
@@ -201,7 +176,7 @@ def _tensor(
     return (array.astype(np.uint32) << np.uint32(16)).view(np.float32)
 
 
-def _parameter(machine: "Machine", data: Any, *_: Any) -> np.ndarray:
+def _parameter(machine: Machine, data: Any, *_: Any) -> np.ndarray:
     if isinstance(data, np.ndarray):
         return data
     raise Refused("a parameter without a tensor")

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from bodyslam_jax.geometry.runs import runs
+from bodyslam_jax.geometry.arrays import runs
 
 _NUM_SAMPLES = 320
 """Number of samples along the longer side of the images that are compared."""

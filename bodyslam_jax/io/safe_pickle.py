@@ -17,8 +17,9 @@ from typing import Any
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import plain_arrays
+from bodyslam_jax.io.pickle_instructions import STEPS
 from bodyslam_jax.io.pickle_machine import Machine
-from bodyslam_jax.io.pickle_names import STORAGES
+from bodyslam_jax.io.pickle_names import CALLS, INERT, STORAGES
 from bodyslam_jax.io.pickle_values import Name, StandIn, Storage
 from bodyslam_jax.io.plain_arrays import Account, Damaged, Refused, shown
 
@@ -33,6 +34,12 @@ _TEXT_PICKLES = (b"(", b"c", b"}", b"]")
 """First bytes of containers and objects in protocols 0 and 1, which have no magic
 number."""
 _OLD_TORCH = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."
+
+
+class _PlainMachine(Machine):
+    """The machine with the instructions and names of result files."""
+
+    instructions, calls, inert = STEPS, CALLS, INERT
 
 
 def restricted_load(
@@ -98,7 +105,7 @@ def _load_pickle(
     if not data.startswith((b"\x80", *_TEXT_PICKLES)):
         raise Damaged("neither a pickle nor an archive")
     account.spend(len(data))
-    return Machine(data, 0, account, stand_ins).load()
+    return _PlainMachine(data, 0, account, stand_ins).load()
 
 
 def _unpacked(file: Any, head: bytes, account: Account) -> bytes | bytearray:
@@ -166,7 +173,7 @@ def _load_array(
         account.check(size, "an array of objects")
         data = _taken(file, size - used)
         account.spend(len(data))
-        return Machine(data, 0, account, stand_ins).load()
+        return _PlainMachine(data, 0, account, stand_ins).load()
     wanted = plain_arrays.num_bytes(of, shape, account)
     if wanted != size - used:
         what = f"an array {of.code}{shape} has {wanted} bytes"
@@ -248,7 +255,7 @@ class _Torch:
             raise Refused("numbers whose most significant byte comes first")
         data = self._read(f"{self.folder}data.pkl")
         self.account.spend(len(data))
-        return Machine(data, 0, self.account, self.stand_ins, self.storage).load()
+        return _PlainMachine(data, 0, self.account, self.stand_ins, self.storage).load()
 
     def storage(self, pid: Any) -> Storage:
         """Returns the storage that a reference of the pickle names."""

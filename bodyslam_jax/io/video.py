@@ -1,8 +1,12 @@
-"""Video file or folder of images -> frames, one at a time, and when they were taken."""
+"""Video file or folder of images -> frames, one at a time, and when they were taken.
+
+Frames are also written as image files, under the names that camera files refer to.
+"""
 
 import dataclasses
 import logging
 import re
+import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
@@ -18,7 +22,6 @@ from bodyslam_jax.io.repeats import Repeats, repeats_warning, without_repeats
 from bodyslam_jax.types import Sequence
 
 _log = logging.getLogger(__name__)
-
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 _VIDEO_SUFFIXES = """
 mp4 mov m4v qt avi mkv webm mpg mpeg mpe m1v m2v mpv mts m2ts m2t ts mod tod vob 3gp
@@ -36,6 +39,8 @@ container's value is taken for a mistake."""
 _QUARTER_SIZE, _MIN_LARGE_SIDE_PX = cv2.IMREAD_REDUCED_GRAYSCALE_4, 1000
 _MAX_JITTER = 0.25
 """Largest spread of frame intervals of a fixed rate, relative to their median."""
+_JPEG_QUALITY = 95
+"""Quality of JPEG files, 0 to 100."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -289,3 +294,52 @@ def _read_image(path: Path, gray: bool) -> np.ndarray:
 
 def _size(shape: tuple[int, ...]) -> str:
     return f"{shape[1]}x{shape[0]} px"
+
+
+def frame_name(frame: int, suffix: str = ".jpg") -> str:
+    """Returns the name of a frame's image, counted from 0."""
+    return f"frame_{frame:06d}{suffix}"
+
+
+def extract_frames(
+    video: Path,
+    timestamps: Float[np.ndarray, " t"],
+    chosen: Int[np.ndarray, " n"],
+    folder: Path,
+) -> list[str]:
+    """Writes frames of a result into a folder and returns their names.
+
+    Images of a folder are copied, under their own names. Of a video the frames at those
+    times are written as `frame_000000.jpg`, numbered as in the result.
+
+    Args:
+        timestamps: of all frames of the result, s from the first frame of the video.
+        chosen: which of them are written, increasing.
+
+    **Raises:** `InputError`, naming the video, if it is another one.
+    """
+    rate = (len(timestamps) - 1) / max(np.ptp(timestamps), 1e-9)
+    times = look_at(video, rate).timestamps
+    files = list_images(video) if video.is_dir() else None
+    if len(times) == len(timestamps):
+        at = np.arange(len(times))
+    else:
+        at = np.abs(times[:, None] - timestamps).argmin(axis=0)
+        away = np.abs(times[at] - timestamps).max()
+        if away > 0.5 / rate or len(np.unique(at)) < len(at):
+            raise InputError(
+                f"{video}: {len(times)} frames in {times[-1]:.2f} s, expected the "
+                f"run's {len(timestamps)}, to {timestamps[-1]:.2f} s: another video."
+            )
+    folder.mkdir(parents=True, exist_ok=True)
+    at = at[chosen]
+    if files is not None:
+        for k in at:
+            shutil.copyfile(files[k], folder / files[k].name)
+        return [files[k].name for k in at]
+    names = [frame_name(int(k)) for k in chosen]
+    images = picked(frames(video), at)
+    for name, image in zip(names, images, strict=True):
+        _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        (folder / name).write_bytes(data.tobytes())
+    return names

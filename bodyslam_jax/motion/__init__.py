@@ -12,9 +12,9 @@ from bodyslam_jax.motion.capture.readers import read_motion as read_motion
 from bodyslam_jax.motion.capture.retarget import fit_shape as fit_shape
 from bodyslam_jax.motion.capture.retarget import place as place
 from bodyslam_jax.motion.contact_network import ContactModel as ContactModel
+from bodyslam_jax.motion.contact_network import load_contact_model as load_contact_model
 from bodyslam_jax.motion.contact_network import predict_contact as predict_contact
-from bodyslam_jax.motion.contact_weights import load_contact_model as load_contact_model
-from bodyslam_jax.motion.contact_weights import save_contact_model as save_contact_model
+from bodyslam_jax.motion.contact_network import save_contact_model as save_contact_model
 from bodyslam_jax.motion.continuation import Rollout as Rollout
 from bodyslam_jax.motion.continuation import rollout as rollout
 from bodyslam_jax.motion.network import Guess as Guess
@@ -41,8 +41,8 @@ from bodyslam_jax.motion.training.figures import draw_errors as draw_errors
 from bodyslam_jax.motion.training.figures import draw_history as draw_history
 from bodyslam_jax.motion.training.figures import draw_rollout as draw_rollout
 from bodyslam_jax.motion.training.figures import write_table as write_table
-from bodyslam_jax.motion.training.noise import disturb as disturb
-from bodyslam_jax.motion.training.noise import drift as drift
+from bodyslam_jax.motion.training.sampling import disturb as disturb
+from bodyslam_jax.motion.training.sampling import drift as drift
 from bodyslam_jax.motion.training.train import train as train
 from bodyslam_jax.motion.weights import load_motion_model as load_motion_model
 from bodyslam_jax.motion.weights import save_motion_model as save_motion_model

@@ -1,4 +1,12 @@
-"""Predicts displacements of the pelvis between frames from a sequence of postures."""
+"""Predicts displacements of the pelvis between frames from a sequence of postures.
+
+`straightened` removes steady yaw from the orientations that are input to the motion
+model. Training data are mostly straight walks; on curves the network underestimates
+displacements by some per cent. A curve changes the direction of later steps, which
+does not matter in the frame of the previous pose, in which displacement is predicted.
+So the slowly varying yaw rate about the body's up axis is removed, and the oscillation
+with each stride is kept.
+"""
 
 from typing import TypeVar
 
@@ -14,7 +22,9 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.network import MotionNetwork, Window
 from bodyslam_jax.motion.position_network import MetricNetwork
-from bodyslam_jax.motion.yaw_removal import straightened, turning_rate
+
+_SIGMA_FRAMES = 15
+"""Standard deviation of the smoothing kernel, frames at 30 fps: about half a stride."""
 
 
 class MotionModel(eqx.Module):
@@ -125,7 +135,7 @@ def predict(
         present: frames that are used.
 
     Neither position, heading nor the direction of gravity is needed. For the default
-    network steady yaw is removed from the orientations first (`yaw_removal.py`), which
+    network steady yaw is removed from the orientations first, which
     uses orientations up to 1.5 s ahead; the paper's network and users' functions see
     the orientations as they are.
 
@@ -158,3 +168,43 @@ def predict(
         rotation=front(so3.compose(turn, guess.rotation), jnp.zeros((t, 3), dtype)),
         valid=jnp.concatenate([jnp.zeros(past, bool), valid]),
     )
+
+
+def turning_rate(
+    orientation: Float[Array, "t 3 3"], present: Bool[Array, " t"]
+) -> Float[Array, " t"]:
+    """Returns the low-pass filtered yaw about the body's y axis from frame k-1 to k,
+    rad, in row k.
+
+    `orientation` rotates H into any fixed frame: the result depends neither on its
+    heading nor on its up axis. Frames that are not `present` have no weight.
+    """
+    step = so3.log(so3.inverse(orientation[:-1]) @ orientation[1:])[:, 1]
+    weight = (present[:-1] & present[1:]).astype(step.dtype)
+    reach = min(3 * _SIGMA_FRAMES, len(orientation))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SIGMA_FRAMES) ** 2)
+    kernel = jnp.asarray(kernel, step.dtype)
+    smooth = lambda x: jnp.convolve(x, kernel, "full")[reach : reach + len(x)]
+    rate = smooth(jnp.where(weight > 0, step, 0)) / jnp.maximum(smooth(weight), 1e-3)
+    return jnp.concatenate([jnp.zeros_like(rate[:1]), rate])
+
+
+def straightened(
+    orientation: Float[Array, "t 3 3"], rate: Float[Array, " t"]
+) -> Float[Array, "t 3 3"]:
+    """Subtracts `rate` from the relative rotations: `C'_k = C'_{k-1} Y(-rate) ΔC_k`."""
+    up = jnp.array([0.0, 1.0, 0.0], rate.dtype)
+    step = so3.inverse(orientation[:-1]) @ orientation[1:]
+    step = so3.exp(-rate[1:, None] * up) @ step
+    products = jnp.concatenate([orientation[:1], step])
+    frame = jnp.arange(len(products))
+
+    # Each pass doubles the number of factors. `associative_scan` would put every pass
+    # into the program, which takes longer to compile than to run.
+    def double(level, products):
+        back = frame - jnp.left_shift(jnp.ones_like(frame), level.astype(frame.dtype))
+        longer = products[jnp.maximum(back, 0)] @ products
+        return jnp.where((back >= 0)[:, None, None], longer, products)
+
+    passes = (len(products) - 1).bit_length()
+    return jax.lax.fori_loop(0, passes, double, products)

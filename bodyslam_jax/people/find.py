@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from bodyslam_jax.config import Association, Detect
-from bodyslam_jax.io.keypoints.doubles import doubles, is_stray
+from bodyslam_jax.io.keypoints.associate import doubles, is_stray
 from bodyslam_jax.people import blazepose, movenet
 from bodyslam_jax.people.appearance import DESCRIPTOR_SIZE, describe
 from bodyslam_jax.people.found import (

@@ -20,11 +20,10 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import uniform_filter1d
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.body.kinematics_numpy import pose_joints
-from bodyslam_jax.body.skeleton import BODY25, HEAD, KEYPOINT_JOINT
+from bodyslam_jax.body.skeleton import BODY25, HEAD, KEYPOINT_JOINT, pose_joints
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.geometry.camera import MIN_DEPTH, project_rows
-from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.people.costs import KEYPOINT_SIGMA
 from bodyslam_jax.people.keypoint_errors import keypoint_sigma
 from bodyslam_jax.sfm import person_masks

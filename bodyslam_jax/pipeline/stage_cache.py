@@ -22,10 +22,9 @@ import numpy as np
 from jaxtyping import AbstractArray, jaxtyped
 
 from bodyslam_jax.body import search_paths
-from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.config.errors import InputError, error_line
 from bodyslam_jax.io import atomic, files
 from bodyslam_jax.io.archive import read_npz
-from bodyslam_jax.io.error_line import error_line
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from scipy import sparse
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.geometry.grouped_sums import sum_by
+from bodyslam_jax.geometry.arrays import sum_by
 
 
 @dataclasses.dataclass

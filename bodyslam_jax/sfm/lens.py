@@ -19,7 +19,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from bodyslam_jax.geometry.grouped_sums import sum_by
+from bodyslam_jax.geometry.arrays import sum_by
 from bodyslam_jax.sfm.bundle import Scene, Views
 from bodyslam_jax.sfm.lens_fit import (
     NUM_TIME_PIECES,

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.geometry.grouped_sums import sum_by
+from bodyslam_jax.geometry.arrays import sum_by
 from bodyslam_jax.sfm.bundle import ERROR_PER_SIGMA, Views
 
 _CAUCHY_SCALE = 2.0

@@ -8,7 +8,7 @@ other pieces on the same point.
 import numpy as np
 from jaxtyping import Float, Int
 
-from bodyslam_jax.geometry.grouped_sums import sum_by
+from bodyslam_jax.geometry.arrays import sum_by
 from bodyslam_jax.sfm.bundle import Scene, Views, jacobian_of_points
 
 

@@ -5,10 +5,10 @@ from bodyslam_jax.simulation.exact_scene import Scene as Scene
 from bodyslam_jax.simulation.exact_scene import look_at as look_at
 from bodyslam_jax.simulation.exact_scene import scene as scene
 from bodyslam_jax.simulation.exact_scene import walk as walk
-from bodyslam_jax.simulation.recorded import OTHER as OTHER
-from bodyslam_jax.simulation.recorded import RECORDINGS as RECORDINGS
 from bodyslam_jax.simulation.renderer import render as render
 from bodyslam_jax.simulation.sequences import LENGTH as LENGTH
+from bodyslam_jax.simulation.sequences import OTHER as OTHER
+from bodyslam_jax.simulation.sequences import RECORDINGS as RECORDINGS
 from bodyslam_jax.simulation.sequences import SimulatedSequence as SimulatedSequence
 from bodyslam_jax.simulation.sequences import as_sequence as as_sequence
 from bodyslam_jax.simulation.sequences import as_truth as as_truth

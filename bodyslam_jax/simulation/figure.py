@@ -12,14 +12,7 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.ndimage import gaussian_filter
 
-from bodyslam_jax.simulation.body_regions import Head, parts_of
-from bodyslam_jax.simulation.garments import (
-    hair_sheet,
-    skirt_sheet,
-    with_sheet,
-    with_shoes,
-)
-from bodyslam_jax.simulation.outfit import (
+from bodyslam_jax.simulation.body_regions import (
     EYE,
     HAIR,
     IRIS,
@@ -30,8 +23,16 @@ from bodyslam_jax.simulation.outfit import (
     SKIN,
     SOLE,
     TROUSERS,
+    Head,
     Outfit,
     draw_outfit,
+    parts_of,
+)
+from bodyslam_jax.simulation.garments import (
+    hair_sheet,
+    skirt_sheet,
+    with_sheet,
+    with_shoes,
 )
 from bodyslam_jax.simulation.posing import Person
 from bodyslam_jax.simulation.raster import Hits, vertex_normals

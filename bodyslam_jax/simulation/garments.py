@@ -3,8 +3,7 @@
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from bodyslam_jax.simulation.body_regions import Head
-from bodyslam_jax.simulation.outfit import SHOES, SOLE, Outfit
+from bodyslam_jax.simulation.body_regions import SHOES, SOLE, Head, Outfit
 from bodyslam_jax.simulation.posing import Person
 
 _RINGS, _SPOKES = 14, 40

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bodyslam_jax.body import DETECTOR_BIAS, KEYPOINT_NAMES, BodyModel
-from bodyslam_jax.body.kinematics_numpy import pose_joints
-from bodyslam_jax.body.skeleton import KEYPOINT_JOINT, SURFACE_POINTS
+from bodyslam_jax.body.skeleton import KEYPOINT_JOINT, SURFACE_POINTS, pose_joints
 from bodyslam_jax.geometry import so3_numpy as so3
 
 

@@ -1,9 +1,22 @@
-"""Rasterises meshes of small triangles with a z-buffer, in NumPy."""
+"""Rasterises meshes of small triangles with a z-buffer, in NumPy.
+
+`make_texture` generates images with detail at every scale: stains, tiles, shapes,
+letters.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
+from scipy.ndimage import zoom
+
+_BASE_COLOURS = {
+    "floor": (105, 125, 150),
+    "ceiling": (185, 190, 190),
+    "wall": (160, 165, 165),
+    "furniture": (90, 120, 160),
+}
+"""Mean colour, BGR."""
 
 
 class Hits(NamedTuple):
@@ -102,3 +115,92 @@ def vertex_normals(
         axis=1,
     )
     return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+
+
+def make_texture(
+    rng: np.random.Generator, height: int, width: int, kind: str, per_metre: float
+) -> UInt8[np.ndarray, "{height} {width} 3"]:
+    """Returns a texture for a floor, wall, ceiling or furniture, with `per_metre`
+    texels per metre.
+
+    BRISK finds corners in it at distances from half a metre to ten, and no part of it
+    repeats.
+    """
+    base = np.array(_BASE_COLOURS[kind], np.float32) * rng.uniform(0.8, 1.15)
+    base = base * rng.uniform(0.9, 1.1, 3)
+    image = base * (1 + 0.22 * _clouds(rng, height, width))[:, :, None]
+    if kind in ("floor", "ceiling"):
+        _tile(rng, image, per_metre * (0.5 if kind == "floor" else 0.6))
+    if kind == "furniture":
+        _grain(rng, image)
+    area = height * width / per_metre**2
+    for size, density in ((0.30, 0.8), (0.12, 4.0), (0.05, 16.0), (0.025, 30.0)):
+        for _ in range(rng.poisson(density * area)):
+            _shape(rng, image, size * per_metre * rng.uniform(0.6, 1.5))
+    for _ in range(rng.poisson(1.5 * area)):
+        _letters(rng, image, max(1, round(0.012 * per_metre * rng.uniform(0.6, 2.5))))
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def _clouds(
+    rng: np.random.Generator, height: int, width: int
+) -> Float[np.ndarray, "{height} {width}"]:
+    """Returns noise of all sizes from the whole texture down to four texels, about
+    ±1."""
+    total = np.zeros((height, width), np.float32)
+    cell, weight = 128, 1.0
+    while cell >= 4:
+        shape = (height // cell + 2, width // cell + 2)
+        coarse = rng.standard_normal(shape).astype(np.float32)
+        total += weight * np.asarray(zoom(coarse, cell, order=1))[:height, :width]
+        cell, weight = cell // 4, 0.6 * weight
+    return total / 1.6
+
+
+def _tile(rng: np.random.Generator, image: np.ndarray, size: float) -> None:
+    """Draws tiles or boards, each a little brighter or darker, with dark joints."""
+    height, width = image.shape[:2]
+    rows = np.append(np.arange(0, height, max(size, 4)), height).astype(int)
+    columns = np.append(np.arange(0, width, max(size, 4)), width).astype(int)
+    for top, bottom in zip(rows[:-1], rows[1:], strict=True):
+        for left, right in zip(columns[:-1], columns[1:], strict=True):
+            image[top:bottom, left:right] *= rng.uniform(0.85, 1.15)
+            image[top : top + 1, left:right] *= 0.6
+            image[top:bottom, left : left + 1] *= 0.6
+
+
+def _grain(rng: np.random.Generator, image: np.ndarray) -> None:
+    """Draws streaks along the rows, as of wood."""
+    lines = rng.standard_normal((image.shape[0], 1, 1)).astype(np.float32)
+    image *= 1 + 0.08 * lines
+
+
+def _shape(rng: np.random.Generator, image: np.ndarray, size: float) -> None:
+    """Draws a disc, a ring, a rectangle or a frame, darker or brighter than the
+    background."""
+    h, w = np.maximum(2, size * rng.uniform(0.5, 1.0, 2)).astype(int)
+    top = int(rng.integers(0, max(1, image.shape[0] - h)))
+    left = int(rng.integers(0, max(1, image.shape[1] - w)))
+    patch = image[top : top + h, left : left + w]
+    y = (np.arange(patch.shape[0])[:, None] + 0.5) / h * 2 - 1
+    x = (np.arange(patch.shape[1]) + 0.5) / w * 2 - 1
+    radius = np.hypot(x, y) if rng.random() < 0.4 else np.maximum(abs(x), abs(y))
+    mask = radius <= 1
+    if rng.random() < 0.35:
+        mask &= radius > 0.6
+    tint = rng.uniform(0.75, 1.25, 3) * rng.choice([0.35, 0.5, 1.5, 1.9])
+    np.multiply(patch, tint.astype(np.float32), out=patch, where=mask[:, :, None])
+
+
+def _letters(rng: np.random.Generator, image: np.ndarray, dot: int) -> None:
+    """Draws a word of random letters of 5 by 7 dots."""
+    count = int(rng.integers(2, 7))
+    dots = rng.random((7, 6 * count)) < 0.5
+    dots[:, 5::6] = False
+    mask = np.kron(dots, np.ones((dot, dot), bool))
+    if rng.random() < 0.2:
+        mask = mask.T
+    top = int(rng.integers(0, max(1, image.shape[0] - mask.shape[0])))
+    left = int(rng.integers(0, max(1, image.shape[1] - mask.shape[1])))
+    patch = image[top : top + mask.shape[0], left : left + mask.shape[1]]
+    patch[mask[: patch.shape[0], : patch.shape[1]]] *= rng.choice([0.3, 1.7])

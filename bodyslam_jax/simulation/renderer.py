@@ -19,11 +19,10 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 from bodyslam_jax.motion import FPS
 from bodyslam_jax.simulation.figure import Figure, dress
-from bodyslam_jax.simulation.raster import rasterise, vertex_normals
+from bodyslam_jax.simulation.raster import make_texture, rasterise, vertex_normals
 from bodyslam_jax.simulation.room import Room, Surface, texture_size
 from bodyslam_jax.simulation.sequences import SimulatedSequence
 from bodyslam_jax.simulation.shutter import Shutter, around, cameras_at
-from bodyslam_jax.simulation.texture import make_texture
 
 _NEAR_PLANE_M = 0.05
 _MIPMAP_LEVELS = 7

@@ -15,9 +15,9 @@ from bodyslam_jax.solver.covariance import marginals as marginals
 from bodyslam_jax.solver.marginalisation import Remainder as Remainder
 from bodyslam_jax.solver.marginalisation import marginalise as marginalise
 from bodyslam_jax.solver.observability import observability as observability
-from bodyslam_jax.solver.schedule import PAPER_SCHEDULE as PAPER_SCHEDULE
-from bodyslam_jax.solver.schedule import Stage as Stage
-from bodyslam_jax.solver.schedule import paper_schedule as paper_schedule
 from bodyslam_jax.solver.solution import Solution as Solution
+from bodyslam_jax.solver.solve import PAPER_SCHEDULE as PAPER_SCHEDULE
+from bodyslam_jax.solver.solve import Stage as Stage
+from bodyslam_jax.solver.solve import paper_schedule as paper_schedule
 from bodyslam_jax.solver.solve import restrict as restrict
 from bodyslam_jax.solver.solve import solve as solve

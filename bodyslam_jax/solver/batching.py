@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from bodyslam_jax.graph.tracing import is_alone, is_traced
+from bodyslam_jax.geometry.lengths import is_alone, is_traced
 from bodyslam_jax.solver.compilation import quick_jit
 
 

@@ -13,9 +13,8 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.graph import Layout
 from bodyslam_jax.solver.blocks import CAMERAS, Sizes
-from bodyslam_jax.solver.loops import row_of, scan_used, with_row
 from bodyslam_jax.solver.reduced_system import Chunks
-from bodyslam_jax.solver.triangular import half_of
+from bodyslam_jax.solver.triangular import half_of, row_of, scan_used, with_row
 
 
 class Factor(eqx.Module):

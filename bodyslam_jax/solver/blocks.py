@@ -2,6 +2,10 @@
 
 Names of blocks: `("pose", "root", d)` couples the pose of frame k with the root of
 frame k - d; `alone` is a camera without a person.
+
+A step turns joint j by `Exp((B z)_j)` on its right, with `p` coordinates z for each
+person and frame, and B the columns of `Problem.basis`, or the identity (every turn).
+Turns that are held have rows of zeros in B.
 """
 
 import equinox as eqx
@@ -10,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from bodyslam_jax.graph import CHUNK, Problem, State, Step
-from bodyslam_jax.solver.posture import posture_width
+from bodyslam_jax.graph import CHUNK, TURNS, Problem, State, Step
 
 CAMERAS = 6 * CHUNK
 """Coordinates of a chunk's cameras."""
@@ -33,7 +36,7 @@ class Sizes(eqx.Module):
     lasting: int = eqx.field(static=True)
     """Number of landmarks that are eliminated last."""
     posture: int = eqx.field(static=True)
-    """Number of coordinates of a posture (`posture.py`)."""
+    """Number of coordinates of a posture."""
     dtype: np.dtype = eqx.field(static=True)
     """Precision of blocks and factors: the state's, or a lower one (see `solve`);
     landmarks' own blocks have the state's."""
@@ -216,3 +219,42 @@ def own_to_global(sizes: Sizes, person: int | None) -> Array:
     if person is None:
         return common
     return jnp.concatenate([common, len(common) + 10 * person + jnp.arange(10)])
+
+
+def posture_width(problem: Problem) -> int:
+    """Returns the number p of coordinates of one posture in a step."""
+    return TURNS if problem.basis is None else problem.basis.shape[1]
+
+
+def basis_of(problem: Problem, dtype) -> Float[Array, "69 p"]:
+    """Returns the matrix B from coordinates to turns (rad), with no turn held."""
+    if problem.basis is None:
+        return jnp.eye(TURNS, dtype=dtype)
+    return problem.basis.astype(dtype)
+
+
+def to_coordinates(
+    problem: Problem, columns: Float[Array, "*b 69"]
+) -> Float[Array, "*b p"]:
+    """Converts derivatives by turns, of which none is held, into derivatives by
+    coordinates: columns `J B`."""
+    return columns if problem.basis is None else columns @ problem.basis
+
+
+def from_turns(
+    problem: Problem, slope: Float[Array, "h t 23 3"]
+) -> Float[Array, "h t p"]:
+    """Converts a gradient by turns, 0 where they are held, into one by coordinates:
+    `B^T slope`."""
+    held = problem.free.poses * slope
+    return to_coordinates(problem, held.reshape(*slope.shape[:2], TURNS))
+
+
+def to_turns(
+    problem: Problem, moved: Float[Array, "h t p"]
+) -> Float[Array, "h t 23 3"]:
+    """Returns the turns `B z` (rad) of a step, 0 where they are held."""
+    free = problem.free.poses
+    if problem.basis is not None:
+        moved = moved @ problem.basis.T.astype(moved.dtype)
+    return free.astype(moved.dtype) * moved.reshape(free.shape)

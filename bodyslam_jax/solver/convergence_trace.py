@@ -10,15 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from bodyslam_jax.geometry.lengths import is_traced
 from bodyslam_jax.graph import Problem, State
-from bodyslam_jax.graph.tracing import is_traced
 from bodyslam_jax.solver.batching import sequential_vmap
 from bodyslam_jax.solver.compilation import in_full_precision, quick_jit
 from bodyslam_jax.solver.levenberg_marquardt import lifted
 from bodyslam_jax.solver.padding import pad, unpad
-from bodyslam_jax.solver.schedule import Stage, check_schedule
 from bodyslam_jax.solver.solution import Solution, only, outcome
 from bodyslam_jax.solver.solve import (
+    Stage,
+    check_schedule,
     check_start,
     is_mixed,
     method_of,

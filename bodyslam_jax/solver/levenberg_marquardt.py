@@ -9,6 +9,8 @@ triangulated anew (`retriangulation.py`).
 
 The stages of a schedule are phases of one loop that differ by a mask, so that they are
 compiled once, together with the factorisation that covariances need.
+
+`Loop` is the state of the loop, `History` its record, `Final` its last equations.
 """
 
 import dataclasses
@@ -28,11 +30,12 @@ from bodyslam_jax.solver.best_scale import (
     best_scale,
     is_quadratic,
 )
-from bodyslam_jax.solver.blocks import Linearisation, sizes_of
+from bodyslam_jax.solver.block_cholesky import Factor
+from bodyslam_jax.solver.blocks import Linearisation, Observations, sizes_of
+from bodyslam_jax.solver.elimination.person import RootFactor
 from bodyslam_jax.solver.linear_system import Eliminated, damped, diagonals, eliminate
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
-from bodyslam_jax.solver.lm_state import Final, History, Loop
 from bodyslam_jax.solver.retriangulation import triangulate_anew
 from bodyslam_jax.solver.second_order import add_second_order, curvature_if, next_share
 from bodyslam_jax.solver.step import Trial, attempt, least_damping
@@ -273,6 +276,16 @@ def _first(problem, observations, state, dtype):
     return final_of(lin, eliminate(problem, lin, sizes, extra)), prediction
 
 
+class Final(eqx.Module):
+    """The factorised normal equations, barely damped, where the solver stopped."""
+
+    lin: Linearisation
+    """Without the second-order term of keypoints, which `factor` may include."""
+    factor: Factor
+    roots: RootFactor | None
+    """Factor of the people's roots that were eliminated within chunks."""
+
+
 def final_of(lin: Linearisation, eliminated: Eliminated) -> Final:
     """Returns the parts of a factorisation that a solve keeps."""
     people = eliminated.people
@@ -302,3 +315,52 @@ def _linearise_anew(problem, observations, state, dtype, begins, ends):
 def lifted(state: State, problem: Problem) -> list[Array]:
     """Returns the lifted residuals of all factors, as a stock solver sees them."""
     return [robustify(f.loss, residual_of(f, state)) for f in problem.factors]
+
+
+class History(eqx.Module):
+    """One row an iteration, of which the first `num_steps` are filled.
+
+    Times are not recorded: the loop is one compiled program (see `clock`).
+    """
+
+    cost: Float[Array, "*s _"]
+    """Cost before each iteration, and after the last."""
+    terms: Float[Array, "*s _ k"]
+    """Cost by factor, in the order of the problem."""
+    damping: Float[Array, "*s n"]
+    step: Float[Array, "*s n"]
+    """Length of the step in standard deviations: `sqrt(δ^T diag(H) δ)`."""
+    accepted: Bool[Array, "*s n"]
+
+
+class Loop(eqx.Module):
+    """The state of `StructuredLevenbergMarquardt` between two iterations."""
+
+    stage: Int[Array, ""]
+    """Stage that runs now; the number of stages in the last rounds, which evaluate the
+    cost and factorise for covariances."""
+    prediction: Any
+    observations: Observations | None
+    final: Final
+    stale: Bool[Array, ""]
+    """Whether `final.lin` belongs to an earlier state or stage."""
+    damping: Float[Array, ""]
+    least_damping: Float[Array, ""]
+    """Least damping in this stage, above those at which factorisations failed."""
+    landmark_damping: Float[Array, " l"]
+    """Least damping of each landmark, as a share of its own diagonal."""
+    searched: Int[Array, ""]
+    """Number of retriangulations of landmarks in this stage."""
+    nu: Float[Array, ""]
+    cost: Float[Array, ""]
+    first_cost: Float[Array, ""]
+    better_scale: Float[Array, ""]
+    """Another s with a lower cost where the solve ended; NaN if none is known."""
+    steps: Int[Array, " s"]
+    share: Float[Array, ""]
+    """Share of the second-order term of keypoints in the next step."""
+    bent: Bool[Array, ""]
+    """Whether the last factorisation includes all of the second-order term."""
+    finished: Bool[Array, ""]
+    result: optx.RESULTS
+    history: History

@@ -24,6 +24,7 @@ from bodyslam_jax.solver.blocks import (
     cast,
     globals_of,
     own_to_global,
+    to_turns,
 )
 from bodyslam_jax.solver.elimination.person import (
     People,
@@ -34,12 +35,11 @@ from bodyslam_jax.solver.elimination.schur import (
     Halves,
     eliminate_landmarks,
     half_inverses,
+    move_lasting,
     substitute_landmarks,
 )
 from bodyslam_jax.solver.front import Window, window_of
 from bodyslam_jax.solver.linearise.marginal_prior import diagonal_of_prior
-from bodyslam_jax.solver.long_tracks import move_lasting
-from bodyslam_jax.solver.posture import to_turns
 from bodyslam_jax.solver.reduced_system import Chunks, add_marginal_prior, assemble
 
 
@@ -156,7 +156,7 @@ def _low(lin: Linearisation, sizes: Sizes) -> Linearisation:
 
 
 class Move(NamedTuple):
-    """A step, and the coordinates of its postures (`posture.py`)."""
+    """A step, and the coordinates of its postures (`blocks.py`)."""
 
     step: Step
     postures: Float[Array, "h t p"]

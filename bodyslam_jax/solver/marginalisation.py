@@ -43,7 +43,7 @@ from bodyslam_jax.graph import (
 )
 from bodyslam_jax.solver.block_cholesky import Factor as Factorised
 from bodyslam_jax.solver.block_cholesky import factorise
-from bodyslam_jax.solver.blocks import CAMERAS, Sizes, mask_of, sizes_of
+from bodyslam_jax.solver.blocks import CAMERAS, Sizes, basis_of, mask_of, sizes_of
 from bodyslam_jax.solver.compilation import compiled, in_full_precision
 from bodyslam_jax.solver.elimination.schur import half_inverses
 from bodyslam_jax.solver.front import Window
@@ -51,9 +51,7 @@ from bodyslam_jax.solver.linear_system import damped, diagonals, reduce_to_chunk
 from bodyslam_jax.solver.linearise import linearise
 from bodyslam_jax.solver.linearise.landmark import gather
 from bodyslam_jax.solver.linearise.marginal_prior import indices
-from bodyslam_jax.solver.loops import row_of
 from bodyslam_jax.solver.padding import pad
-from bodyslam_jax.solver.posture import basis_of
 from bodyslam_jax.solver.reduced_system import Chunks
 from bodyslam_jax.solver.solve import check_start
 from bodyslam_jax.solver.subproblem import (
@@ -63,6 +61,7 @@ from bodyslam_jax.solver.subproblem import (
     remaining_part,
     restricted,
 )
+from bodyslam_jax.solver.triangular import row_of
 
 _ELIMINATION_DAMPING_EPS = 64
 """Damping of eliminated variables, in units of the machine epsilon: pivots of points

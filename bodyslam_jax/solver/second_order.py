@@ -21,8 +21,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.graph import TURNS, KeypointReprojection, Problem, State
-from bodyslam_jax.solver.blocks import Linearisation, Sizes, cast, mask_of
-from bodyslam_jax.solver.posture import to_coordinates
+from bodyslam_jax.solver.blocks import (
+    Linearisation,
+    Sizes,
+    cast,
+    mask_of,
+    to_coordinates,
+)
 
 _CURVATURE_RTOL = 1e-3
 """Relative decrease of the cost below which a step adds the second-order term."""

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from bodyslam_jax.graph import State
-from bodyslam_jax.solver.lm_state import Final, History
+from bodyslam_jax.solver.levenberg_marquardt import Final, History
 
 _STATUS_BY_RESULT = (
     (optx.RESULTS.successful, "converged"),

@@ -1,21 +1,27 @@
-"""Cholesky factors and their inverses, without LAPACK's batches.
+"""Factorisations, loops and access to rows that compile and run well in XLA.
 
-On a CPU two of jaxlib's batched factorisations or solves at the same time (0.10.2, on
-two cores), of two threads or two devices, wait for each other's threads for ever.
+Cholesky factors and their inverses are made without LAPACK's batches: on a CPU two of
+jaxlib's batched factorisations or solves at the same time (0.10.2, on two cores), of
+two threads or two devices, wait for each other's threads for ever.
+
+Loops run over the used rows of padded tables. `jax.lax.dynamic_index_in_dim` adds a
+function to the program for each shape, and handles negative indices, which are not used
+here.
 """
 
 import functools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
-
-from bodyslam_jax.solver.loops import row_of
+from jaxtyping import Array, Float, Int
 
 MAX_LEAF_WIDTH = 12
 """Maximum width of the blocks that are inverted by substitution."""
+Index = int | Int[Array, ""]
 
 
 def half_of(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
@@ -83,3 +89,47 @@ def _substitute(lower: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
 
     eye = jnp.broadcast_to(jnp.eye(len(index), dtype=lower.dtype), lower.shape)
     return jax.lax.fori_loop(0, len(index), one, eye)
+
+
+def row_of(x: Array, k: Index, axis: int = 0) -> Array:
+    """Returns row `k`, from 0, of an axis, which is dropped."""
+    sizes = [1 if a == axis else n for a, n in enumerate(x.shape)]
+    row = jax.lax.dynamic_slice(
+        x, _start(x, k, axis), sizes, allow_negative_indices=False
+    )
+    return row.reshape(x.shape[:axis] + x.shape[axis + 1 :])
+
+
+def with_row(x: Array, row: Array, k: Index, axis: int = 0) -> Array:
+    """Returns `x` with row `k` of an axis replaced."""
+    wide = jnp.expand_dims(row, axis)
+    start = _start(x, k, axis)
+    return jax.lax.dynamic_update_slice(x, wide, start, allow_negative_indices=False)
+
+
+def _start(x, k, axis):
+    k = jnp.asarray(k)
+    return [k if a == axis else jnp.zeros((), k.dtype) for a in range(x.ndim)]
+
+
+def scan_used(
+    step: Callable[..., Any], carry: Any, rows: Any, used: Int[Array, ""] | None
+) -> tuple[Any, Any]:
+    """Runs `jax.lax.scan` over the first `used` rows; results of the other rows are 0.
+
+    The unused rows take no time. `None` is for all rows; only then is the loop
+    differentiable in reverse mode.
+    """
+    if used is None:
+        return jax.lax.scan(step, carry, rows)
+    at = lambda i: jax.tree.map(lambda x: row_of(x, i), rows)
+    _, struct = jax.eval_shape(step, carry, at(0))
+    count = len(jax.tree.leaves(rows)[0])
+    empty = jax.tree.map(lambda s: jnp.zeros((count, *s.shape), s.dtype), struct)
+
+    def one(i, known):
+        carry, found = step(known[0], at(i))
+        put = lambda whole, row: with_row(whole, row, i)
+        return carry, jax.tree.map(put, known[1], found)
+
+    return jax.lax.fori_loop(0, used, one, (carry, empty))

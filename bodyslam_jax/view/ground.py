@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.body.skeleton import FEET
+from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.geometry.camera import project
-from bodyslam_jax.geometry.runs import runs
 from bodyslam_jax.geometry.stances import standing_feet
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.style import PEOPLE, Image

@@ -1,15 +1,25 @@
-"""Position of the plan and the side view: in a corner without people, or beside."""
+"""Insets of the overlay: camera and people from above (`Plan`) and from the side.
 
+They are in a corner of the image without people, or beside it.
+"""
+
+import cv2
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from bodyslam_jax.body.skeleton import head_ball
 from bodyslam_jax.geometry.camera import project
-from bodyslam_jax.types import Result
-from bodyslam_jax.view.side_view import SideView
-from bodyslam_jax.view.style import Image
-from bodyslam_jax.view.top_view import Plan
+from bodyslam_jax.types import Result, Tracks
+from bodyslam_jax.view.style import (
+    CAMERA,
+    Color,
+    Image,
+    blend_inset,
+    person_styles,
+    polylines,
+    write_text,
+)
 
 _MARGIN_PX = 10
 """Distance of the insets from the picture's edges, px."""
@@ -21,6 +31,16 @@ _MIN_DEPTH_M = 0.05
 """Joints nearer to the camera's plane than this are not visible, m."""
 _COLUMN_COLOR = (28, 28, 28)
 """Colour of the column beside the image, BGR."""
+_MAX_SPAN_M = 8.0
+"""Width of the inset in the world, m; where the paths are longer, it moves along with
+people."""
+_LIMBS = (
+    (15, 12, 9, 6, 3, 0),
+    (0, 1, 4, 7, 10),
+    (0, 2, 5, 8, 11),
+    (22, 20, 18, 16, 13, 9, 14, 17, 19, 21, 23),
+)
+_POINT_COLOR = (90, 230, 120)
 
 
 class Insets:
@@ -97,3 +117,185 @@ def _projected(
     safe = np.where(p_C[..., 2:] > _MIN_DEPTH_M, p_C, [0.0, 0.0, 1.0])
     cast = lambda x: jnp.asarray(x, jnp.float32)
     return np.asarray(project(cast(result.intrinsics), cast(safe)), np.float64)
+
+
+class SideView:
+    """The scene from the side, across the horizontal direction in which paths are
+    longest."""
+
+    def __init__(self, result: Result, width: int):
+        """The inset is `width` wide, px."""
+        self.result, self.width = result, width
+        self.styles = person_styles(result)
+        places = [result.T_WC[result.located, :3, 3]]
+        joints = result.joints[result.present]
+        places.append(joints.reshape(-1, 3))
+        every = np.concatenate(places)
+        level = every[:, [0, 2]] - every[:, [0, 2]].mean(axis=0)
+        self.along = np.zeros(3)
+        self.along[[0, 2]] = np.linalg.svd(level.T @ level)[0][:, 0]
+        # To the right is where the first person, else the camera, goes.
+        ways = [*(j[p, 0] for j, p in zip(result.joints, result.present) if p.any())]
+        way = (ways or [result.T_WC[:, :3, 3]])[0]
+        if (way[-1] - way[0]) @ self.along < 0:
+            self.along = -self.along
+        way = every @ self.along
+        self.centre = (way.min() + way.max()) / 2
+        extent = max(1.15 * (way.max() - way.min()), 3.0)
+        self.moves = extent > _MAX_SPAN_M
+        self.zoom = width / min(extent, _MAX_SPAN_M)
+        self.low = min(0.0, float(every[:, 1].min()))
+        middle, radius = head_ball(joints)
+        top = np.append(every[:, 1], middle[:, 1] + radius).max()
+        high = max(2.1, float(top) + 0.05)
+        self.height = int(np.clip(self.zoom * (high - self.low) + 8, 24, width))
+
+    def draw(self, image: Image, frame: int, corner: tuple[int, int]) -> None:
+        """Puts the inset into the image, its upper left corner at `corner`, px."""
+        r = self.result
+        there = np.flatnonzero(r.present[:, frame])
+        eye = r.T_WC[frame, :3, 3]
+        centre = self.centre
+        if self.moves:
+            centre = float(
+                np.mean([eye @ self.along, *(r.joints[there, frame, 0] @ self.along)])
+            )
+        inset = np.full((self.height, self.width, 3), 28, np.uint8)
+        at = lambda points: self._to_inset(points, centre)
+        reach = self.width / self.zoom / 2
+        for metre in np.arange(np.ceil(centre - reach), centre + reach):
+            post = [metre * self.along, metre * self.along + [0, 9.0, 0]]
+            cv2.polylines(inset, [at(np.array(post))], False, (52, 52, 52), 1, 8, 4)
+        floor = np.array([centre - reach, centre + reach])[:, None] * self.along
+        cv2.polylines(inset, [at(floor)], False, (150, 150, 150), 1, 8, 4)
+        for h in there:
+            limbs = [at(r.joints[h, frame, list(limb)]) for limb in _LIMBS]
+            style = self.styles[h]
+            for limb in limbs:
+                polylines(inset, limb, style.faint, 2, style.dash and (4, 4))
+            middle, radius = head_ball(r.joints[h, frame])
+            round_head = 16 * max(round(float(radius) * self.zoom), 2)
+            place = at(middle[None])[0].tolist()
+            cv2.circle(inset, place, round_head, style.faint, -1, cv2.LINE_AA, 4)
+        if r.located[frame]:
+            right, down, ahead = r.T_WC[frame, :3, :3].T
+            size = 14 / self.zoom
+            tips = eye + size * np.array(
+                [0 * ahead, ahead - 0.5 * down, ahead + 0.5 * down]
+            )
+            cv2.polylines(inset, [at(tips)], True, CAMERA, 2, cv2.LINE_AA, 4)
+        blend_inset(image, inset, corner)
+
+    def _to_inset(
+        self, p: Float[np.ndarray, "n 3"], centre: float
+    ) -> Int[np.ndarray, "n 2"]:
+        u = self.width / 2 + self.zoom * (p @ self.along - centre)
+        v = self.height - 5 - self.zoom * (p[:, 1] - self.low)
+        uv = np.clip(np.stack([u, v], axis=-1), -2000, 4000)
+        return np.round(uv * 16).astype(np.int32)
+
+
+def trails(tracks: Tracks | None, num_frames: int, zoom: np.ndarray) -> list[list]:
+    """Returns, for each frame, its points and their positions in the preceding
+    frames."""
+    found: list[list] = [[] for _ in range(num_frames)]
+    if tracks is None:
+        return found
+    order = np.lexsort((tracks.frame, tracks.landmark))
+    frame, landmark = tracks.frame[order], tracks.landmark[order]
+    uv = (tracks.uv[order] + 0.5) * zoom - 0.5
+    row = np.arange(len(order))
+    begins = np.r_[True, np.diff(landmark) != 0]
+    first = np.maximum.accumulate(np.where(begins, row, 0))
+    oldest = np.maximum(first, row - 6)
+    for k in np.flatnonzero(frame < num_frames):
+        found[frame[k]].append(uv[oldest[k] : k + 1])
+    return found
+
+
+def draw_trails(image: Image, lines: list[np.ndarray]) -> None:
+    curves = [np.round(trail * 16).astype(np.int32) for trail in lines]
+    cv2.polylines(image, curves, False, _POINT_COLOR, 1, cv2.LINE_AA, 4)
+    for line in curves:
+        cv2.circle(image, line[-1].tolist(), 2 * 16, _POINT_COLOR, -1, cv2.LINE_AA, 4)
+
+
+class Plan:
+    """The inset: camera and people from above on a metric grid, up to a frame."""
+
+    def __init__(self, result: Result, size: tuple[int, int]):
+        self.side = int(0.34 * min(size))
+        self.result = result
+        self.styles = person_styles(result)
+        places = [result.T_WC[:, [0, 2], 3]]
+        for joints, present in zip(result.joints, result.present, strict=True):
+            places.append(joints[present, 0][:, [0, 2]])
+        every = np.concatenate(places)
+        low, high = every.min(0), every.max(0)
+        self.centre = (low + high) / 2
+        extent = max(float((high - low).max()) * 1.2, 2.0)
+        self.zoom = self.side / extent
+        steps = (1, 2, 5, 10, 20, 50, 100)
+        larger = 10 ** np.ceil(np.log10(extent / 10))
+        self.step = next((s for s in steps if extent / s <= 10), larger)
+        self.background = self._grid(extent)
+
+    def _to_inset(self, points: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:
+        """Returns positions in the inset, in sixteenths of a pixel: seen from above
+        with z up the picture, x runs to the left."""
+        uv = self.side / 2 - self.zoom * (points - self.centre)
+        return np.round(uv * 16).astype(np.int32)
+
+    def _grid(self, extent: float) -> Image:
+        inset = np.full((self.side, self.side, 3), 28, np.uint8)
+        for axis in range(2):
+            start = np.ceil((self.centre[axis] - extent / 2) / self.step) * self.step
+            lines = np.arange(start, self.centre[axis] + extent / 2, self.step)
+            ends = np.tile(self.centre, (len(lines), 2, 1))
+            ends[:, :, axis] = lines[:, None]
+            ends[:, 0, 1 - axis] -= extent
+            ends[:, 1, 1 - axis] += extent
+            for a, b in ends:
+                a, b = self._to_inset(np.stack([a, b])).tolist()
+                cv2.line(inset, a, b, (62, 62, 62), 1, cv2.LINE_AA, 4)
+        for path, (b, g, r), dash in self._paths(len(self.result.timestamps)):
+            dim = (int(0.45 * b + 16), int(0.45 * g + 16), int(0.45 * r + 16))
+            polylines(inset, self._to_inset(path), dim, 1, dash)
+        return inset
+
+    def _paths(
+        self, end: int
+    ) -> list[tuple[np.ndarray, Color, tuple[int, int] | None]]:
+        """Returns the paths up to a frame, with their colours and dashes."""
+        paths: list[tuple[np.ndarray, Color, tuple[int, int] | None]]
+        paths = [(self.result.T_WC[:end, [0, 2], 3], CAMERA, None)]
+        for h, present in enumerate(self.result.present):
+            visible = np.flatnonzero(present[:end])
+            for part in np.split(visible, np.flatnonzero(np.diff(visible) > 1) + 1):
+                place = self.result.joints[h, part, 0][:, [0, 2]]
+                style = self.styles[h]
+                paths.append((place, style.faint, style.dash))
+        return paths
+
+    def draw(self, image: Image, frame: int, corner: tuple[int, int]) -> None:
+        """Puts the inset into the image, its upper left corner at `corner`, px."""
+        inset = self.background.copy()
+        for path, color, dash in self._paths(frame + 1):
+            if len(path):
+                polylines(inset, self._to_inset(path), color, 2, dash)
+        for h, present in enumerate(self.result.present):
+            if present[frame]:
+                place = self.result.joints[h, frame, :1][:, [0, 2]]
+                spot = self._to_inset(place)[0].tolist()
+                style = self.styles[h]
+                fill = -1 if style.dash is None else 2
+                cv2.circle(inset, spot, 5 * 16, style.faint, fill, cv2.LINE_AA, 4)
+        T = self.result.T_WC[frame]
+        reach = 0.12 * self.side / self.zoom
+        right, ahead = T[[0, 2], 0], T[[0, 2], 2]
+        eye = T[[0, 2], 3]
+        wedge = np.stack([eye, eye + reach * (ahead - 0.5 * right)])
+        wedge = np.concatenate([wedge, [eye + reach * (ahead + 0.5 * right)]])
+        cv2.polylines(inset, [self._to_inset(wedge)], True, CAMERA, 2, cv2.LINE_AA, 4)
+        write_text(inset, f"grid {self.step:g} m, x left", (6, self.side - 7), 0.4)
+        blend_inset(image, inset, corner)

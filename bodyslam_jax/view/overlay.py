@@ -13,11 +13,16 @@ from bodyslam_jax.body import keypoints as keypoints_of
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.types import Keypoints, Result, Tracks
 from bodyslam_jax.view.ground import Ground
-from bodyslam_jax.view.insets import Insets
+from bodyslam_jax.view.insets import Insets, draw_trails, trails
 from bodyslam_jax.view.people import Mesh, coarse_body, draw_people, meshes
-from bodyslam_jax.view.person_style import Legend, person_styles, write_names
-from bodyslam_jax.view.style import PEOPLE, Image, write_text
-from bodyslam_jax.view.top_view import draw_trails, trails
+from bodyslam_jax.view.style import (
+    PEOPLE,
+    Image,
+    Legend,
+    person_styles,
+    write_names,
+    write_text,
+)
 from bodyslam_jax.view.video_file import Codec, write_video
 
 

@@ -19,8 +19,7 @@ from bodyslam_jax.body import BodyModel, vertices
 from bodyslam_jax.diagnostics.reported_status import inferred_bones
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.types import Result
-from bodyslam_jax.view.person_style import PALE, PersonStyle, person_styles
-from bodyslam_jax.view.style import Image, polylines
+from bodyslam_jax.view.style import PALE, Image, PersonStyle, person_styles, polylines
 
 _CELL_M = 0.025
 """Size of the cells in which vertices are merged, m."""

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from bodyslam_jax.export.formats.observations import Observations
 from bodyslam_jax.export.formats.scene import Scene
 from bodyslam_jax.geometry.camera import project
-from bodyslam_jax.io.extract_frames import extract_frames, frame_name
+from bodyslam_jax.io.video import extract_frames, frame_name
 
 PIXEL_CENTRE_OFFSET_PX = 0.5
 """Offset from coordinates with integer pixel centres to those with the origin at the

@@ -1,4 +1,4 @@
-"""The factors of the graph, one file for each kind of measurement.
+"""The factors of the graph, one file for each quantity that is measured.
 
 All are subclasses of `graph.factor.FrameFactor`, except those of landmarks. Factors are
 created from measurements in `initialisation`: those of people in

@@ -15,14 +15,14 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph.factor import FrameFactor, Key
-from bodyslam_jax.graph.losses import Loss, Squared
+from bodyslam_jax.graph.losses import Loss, Squared, innovation
 from bodyslam_jax.graph.pelvis_displacement import previous_frame
 from bodyslam_jax.graph.state import State
-from bodyslam_jax.graph.whitening import innovation
 
 
 class BodyPosePrior(FrameFactor):
-    """`r = (e_k - ρ e_{k-1}) / (σ sqrt(1 - ρ²))` of each joint, `e = Log(C̃^T C(θ))`."""
+    """`r = (e_k - ρ e_{k-1}) / (σ sqrt(1 - ρ²))` of each joint, `e = Log(C̃^T
+    C(θ))`."""
 
     rotation: Float[Array, "h t 23 3"]
     """θ̃, axis-angle, rad."""

@@ -39,3 +39,26 @@ class CameraPrior(FrameFactor):
         camera = window[0].camera
         rotation = so3.log(measured[:3, :3].T @ camera[:3, :3])
         return jnp.concatenate([rotation, camera[:3, 3] - measured[:3, 3]]) / sigma
+
+
+class ScalePrior(FrameFactor):
+    """A known size of the map.
+
+        r = (s - s̃) / σ
+
+    Used where a camera path in metres is given: `s̃` is metres per unit of the map,
+    default `σ = config.PATH_SIGMA s̃`, 1 %. Ours.
+    """
+
+    scale: Float[Array, " t"]
+    """s̃, m per unit of the map."""
+    sigma: Float[Array, " t"]
+    """m per unit of the map; finite in one frame, `inf` in all others."""
+    loss: Loss = Squared()
+    padding = {"sigma": jnp.inf}
+    map_units = {"scale": -1, "sigma": -1}
+    keys = (("scale", 0),)
+
+    def frame_residual(self, data, window, shared):
+        measured, sigma = data
+        return (shared.scale - measured)[None] / sigma

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.graph.factor import FrameFactor, Key, Shared
-from bodyslam_jax.graph.losses import Loss, Squared
+from bodyslam_jax.graph.losses import Loss, Squared, innovation
 from bodyslam_jax.graph.pelvis_displacement import (
     displacement,
     displacements,
@@ -27,7 +27,6 @@ from bodyslam_jax.graph.pelvis_displacement import (
     previous_frame,
 )
 from bodyslam_jax.graph.state import State
-from bodyslam_jax.graph.whitening import innovation
 from bodyslam_jax.motion import leg_length
 
 

@@ -1,10 +1,7 @@
-"""A calibration with a known accuracy.
+"""Intrinsics with a known accuracy, and one focal length for rows and columns.
 
-    r = (i - ĩ) / σ,    i = (fx, fy, cx, cy[, k1, k2, p1, p2])
-
-In px, and dimensionless for distortion. Used where intrinsics are estimated; `σ` is
-that of the calibration or of the guess that stands for one (`pipeline/sfm_stage.py`).
-Ours: the paper's intrinsics are known.
+Both factors are used where intrinsics are estimated; `σ` in px is set by
+`pipeline/sfm_stage.py`. Ours: the paper's intrinsics are known.
 """
 
 import equinox as eqx
@@ -39,3 +36,25 @@ class IntrinsicsPrior(AbstractIntrinsicsFactor):
     def frame_residual(self, data, window, shared):
         measured, sigma = data
         return (shared.intrinsics - measured) / sigma
+
+
+class AspectRatioPrior(AbstractIntrinsicsFactor):
+    """One focal length for rows and columns.
+
+        r = (fx - a fy) / σ
+
+    Used where intrinsics are estimated, with `σ` in px set by `pipeline/sfm_stage.py`.
+    Ours.
+    """
+
+    sigma: Float[Array, " 1"]
+    """px"""
+    loss: Loss = Squared()
+    ratio: float = eqx.field(static=True, default=1.0)
+    """a, the height of a pixel over its width: 1 for square pixels."""
+
+    def data(self):
+        return self.sigma
+
+    def frame_residual(self, data, window, shared):
+        return (shared.intrinsics[:1] - self.ratio * shared.intrinsics[1:2]) / data

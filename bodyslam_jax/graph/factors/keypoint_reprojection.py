@@ -20,9 +20,9 @@ from bodyslam_jax.body import BodyModel, local_keypoints
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.graph.factor import FrameFactor
-from bodyslam_jax.graph.keypoint_curvature import keypoint_curvature
 from bodyslam_jax.graph.keypoint_jacobian import (
     carried_by_joints,
+    keypoint_curvature,
     keypoint_jacobian,
     placed,
 )

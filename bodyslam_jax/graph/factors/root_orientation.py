@@ -12,10 +12,9 @@ from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph.factor import FrameFactor, Key
-from bodyslam_jax.graph.losses import Loss, Squared
+from bodyslam_jax.graph.losses import Loss, Squared, innovation
 from bodyslam_jax.graph.pelvis_displacement import previous_frame
 from bodyslam_jax.graph.state import State
-from bodyslam_jax.graph.whitening import innovation
 
 
 class RootOrientation(FrameFactor):
@@ -67,3 +66,51 @@ class RootOrientation(FrameFactor):
         # Division by sigma comes last: inf * 0 would make the derivative by ρ NaN.
         now = 1 / jnp.sqrt(1 - rho**2) / self.sigma[..., None]
         return now, -rho * now
+
+
+class RelativeOrientation(FrameFactor):
+    """The turn of the person that the motion model predicts.
+
+        r = Log(C̃_k^T C_WH,k-1^T C_WH,k) / σ
+
+    In rad. In no problem by default: the paper's motion model predicts the turn, but
+    the paper's cost does not use it. Ours.
+    """
+
+    rotation: Float[Array, "h t 3"]
+    """Log C̃: rotation vector from H_{k-1} to H_k, rad."""
+    sigma: Float[Array, "h t"]
+    """Per axis, rad; `inf` where not predicted."""
+    loss: Loss = Squared()
+    padding = {"sigma": jnp.inf}
+    keys = (("camera", 0), ("camera", 1), ("root", 0), ("root", 1))
+
+    def frame_residual(self, data, window, shared):
+        rotation, sigma = data
+        now, before = (f.camera[:3, :3] @ f.root[:3, :3] for f in window)
+        predicted = so3.exp(rotation)
+        return so3.log(predicted.T @ before.T @ now) / sigma
+
+
+class UprightPrior(FrameFactor):
+    """A standing person's trunk points along a known up direction.
+
+        r = (C_WC C_CH e_y - u) / σ
+
+    `e_y` is the y axis of the root frame; the length of the difference is the angle by
+    which the trunk leans, in rad, while that is small. In no problem by default;
+    0.1 rad at 30 fps suits people who walk (their pelvises sway by 0.05 rad). Ours.
+    """
+
+    up: Float[Array, " 3"]
+    """u, a unit vector in the world."""
+    sigma: Float[Array, "h t"]
+    """rad; `inf` where the person is absent."""
+    loss: Loss = Squared()
+    padding = {"sigma": jnp.inf}
+    keys = (("camera", 0), ("root", 0))
+
+    def frame_residual(self, data, window, shared):
+        (sigma,), (frame,) = data, window
+        trunk = frame.camera[:3, :3] @ frame.root[:3, 1]
+        return (trunk - self.up) / sigma

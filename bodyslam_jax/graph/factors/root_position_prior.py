@@ -14,8 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from bodyslam_jax.graph.factor import FrameFactor
-from bodyslam_jax.graph.losses import Loss, Squared
-from bodyslam_jax.graph.whitening import innovation
+from bodyslam_jax.graph.losses import Loss, Squared, innovation
 
 
 class RootPositionPrior(FrameFactor):

@@ -12,8 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from bodyslam_jax.io.bodies.body_records import Rows, Video
-from bodyslam_jax.io.bodies.parts import middle, refocused
+from bodyslam_jax.io.bodies.parts import Rows, Video, middle, refocused
 from bodyslam_jax.io.formats import Format, Source, formats
 from bodyslam_jax.types import Intrinsics
 

@@ -1,21 +1,31 @@
 """Functions that readers of regressed bodies share: checks, frames, rotations, cameras.
 
 Errors are `InvalidContent`, to which the caller adds the file's name.
+
+Readers make a table of bodies, `Rows`, from a file and what they need to know of the
+video.
+
+Weak-perspective bodies of cropped images become bodies in the camera frame. A network
+that sees a crop regresses the body's size (`s`) and position (`tx, ty`) in the crop,
+and its rotation relative to the crop's viewing direction. Formulas: `cam_crop2full` of
+CLIFF (Li et al., ECCV 2022) with the true principal point; the rotation by the crop's
+ray is that of Henning et al. (ECCV 2022, Section 3.3).
 """
 
+import dataclasses
+import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from bodyslam_jax.config import Association
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.io.bodies.body_records import Rows, Video
-from bodyslam_jax.io.bodies.perspective import full_translation, turn_to_camera
 from bodyslam_jax.io.budget import MAX_PEOPLE
 from bodyslam_jax.io.declared import as_array
-from bodyslam_jax.io.frame_index import InvalidContent, frames_of_names
+from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.keypoints.associate import identify
 from bodyslam_jax.types import Intrinsics
 
@@ -30,6 +40,9 @@ _BODY_GRID_M = np.stack(
     np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.85, 0.85, 5))
 )
 """Grid of the size of a body around its middle, in the plane of the image, m."""
+_log = logging.getLogger(__name__)
+_MIN_SIZE_PX = 1e-9
+"""Least size, px, which avoids a division by 0; far below that of any person."""
 
 
 def numbers_of(data: dict, key: str, shape: tuple[int, ...] | None) -> np.ndarray:
@@ -104,6 +117,28 @@ def frames_of(data: dict, key: str, n: int, num_frames: int | None) -> np.ndarra
             f"{n} bodies without `{key}`, but the video has {num_frames} frames"
         )
     return np.arange(n)
+
+
+@dataclasses.dataclass(frozen=True)
+class Video:
+    """The video that a file of bodies is read for."""
+
+    camera: Intrinsics
+    num_frames: int | None = None
+    """Number of frames; `None` if it is that of the file."""
+    fps: float | None = None
+    """Frame rate, 1/s; `None` if unknown."""
+    times: Float[np.ndarray, " t"] | None = None
+    """Time of every frame, s; `None` if unknown."""
+    images: tuple[str, ...] = ()
+    """Names of the frames, if the video is a folder of images."""
+    config: Association = Association()
+    warn: Warn = _log.warning
+
+    def frames_in(self, seconds: float) -> int:
+        """Returns the number of frames in so many seconds, at least 1; at 30/s if the
+        video's rate is not known."""
+        return max(1, round(seconds * (self.fps or 30.0)))
 
 
 def frames_of_images(names: list[str], video: Video, *, complete: bool) -> np.ndarray:
@@ -224,6 +259,23 @@ def focals(K: np.ndarray) -> np.ndarray:
     return np.stack([K[:, 0, 0], K[:, 1, 1]], axis=-1)
 
 
+@dataclasses.dataclass(frozen=True)
+class Rows:
+    """`m` bodies in the camera frame, in any order."""
+
+    frame: Int[np.ndarray, " m"]
+    person: Int[np.ndarray, " m"]
+    """Number of each body's person, in any order."""
+    poses: Float[np.ndarray, "m 72"]
+    """SMPL's joint rotations, axis-angle, rad; the first is `R_CH` of the root."""
+    betas: Float[np.ndarray, "m 10"]
+    """SMPL β."""
+    trans: Float[np.ndarray, "m 3"]
+    """Translation, m: the pelvis is at `J_0(β) + trans`."""
+    shapes_regressed: bool = True
+    """As in `Bodies`."""
+
+
 def from_crops(
     frame: np.ndarray,
     person: np.ndarray,
@@ -283,3 +335,42 @@ def genders_in(value: Any) -> tuple[set[str], set[str]]:
         elif word.strip().lower() not in ("", "unknown", "none"):
             other.add(word.strip()[:20])
     return known, other
+
+
+def full_translation(
+    camera: Float[np.ndarray, "m 3"],
+    box: Float[np.ndarray, "m 3"],
+    intrinsics: Intrinsics,
+) -> Float[np.ndarray, "m 3"]:
+    """Returns `trans` (m) of bodies given as `(s, tx, ty)` in square boxes `(cx, cy,
+    side px)`.
+
+    Distortion is ignored: it moves a box's centre, whose own error is larger.
+    """
+    fx, fy, px, py = intrinsics.params[:4]
+    s, tx, ty = camera.T
+    cx, cy, side = box.T
+    scale = side * s + _MIN_SIZE_PX
+    z = 2 * fx / scale
+    x = tx + 2 * (cx - px) / scale
+    # With fx != fy a row of the crop spans fx / fy as many metres as a column.
+    y = ty * fx / fy + 2 * (cy - py) / scale * fx / fy
+    return np.stack([x, y, z], axis=-1)
+
+
+def turn_to_camera(
+    orientation: Float[np.ndarray, "m 3"],
+    box: Float[np.ndarray, "m 3"],
+    intrinsics: Intrinsics,
+) -> Float[np.ndarray, "m 3"]:
+    """Returns root rotations (axis-angle, rad) in the camera, of those relative to each
+    crop's ray; NaN where a rotation or box is not finite.
+
+    The pelvis does not move: rotations pivot at `J_0(β) + trans`.
+    """
+    fx, fy, px, py = intrinsics.params[:4]
+    ray = np.stack([(box[:, 0] - px) / fx, (box[:, 1] - py) / fy], axis=-1)
+    finite = np.isfinite(np.hstack([orientation, ray])).all(axis=1, keepdims=True)
+    ray, turn = np.where(finite, ray, 0.0), np.where(finite, orientation, 0.0)
+    turned = so3.compose(so3.optical_axis_to_ray(ray), turn)
+    return np.where(finite, turned, np.nan)

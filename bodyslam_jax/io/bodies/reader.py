@@ -14,8 +14,7 @@ from jaxtyping import Float
 from bodyslam_jax.config import Association
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.bodies.body_format import body_formats
-from bodyslam_jax.io.bodies.body_records import Rows, Video
-from bodyslam_jax.io.bodies.parts import genders_in
+from bodyslam_jax.io.bodies.parts import Rows, Video, genders_in
 from bodyslam_jax.io.budget import check_bytes, last_frame_problem
 from bodyslam_jax.io.formats import attributed, format_of, names_of
 from bodyslam_jax.io.frame_index import Warn

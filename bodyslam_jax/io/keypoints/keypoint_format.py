@@ -17,7 +17,7 @@ from bodyslam_jax.io.declared import as_array
 from bodyslam_jax.io.declared_size import Size
 from bodyslam_jax.io.files import read_json
 from bodyslam_jax.io.formats import Format, Source, formats
-from bodyslam_jax.io.keypoints.names import names_in
+from bodyslam_jax.io.keypoints.layouts import names_in
 
 GROUP = "bodyslam_jax.keypoint_formats"
 """Entry points of this group are formats of other packages."""

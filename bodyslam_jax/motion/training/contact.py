@@ -1,7 +1,13 @@
 """Trains the contact network on motion capture.
 
-Postures have the same simulated errors as for the motion model (`noise.py`), and bodies
-have random shapes. Labels are those of the exact motion on the subject's own shape.
+Postures have the same simulated errors as for the motion model (`sampling.py`), and
+bodies have random shapes. Labels are those of the exact motion on the subject's own
+shape.
+
+Contacts of heels and toes in motion capture are labelled by their height and speed. In
+captured motion the ground is known to a centimetre and speeds to a few centimetres
+a second, so that a simple rule is accurate. In a video neither is known. The contact
+network learns to predict these labels from postures.
 """
 
 from collections.abc import Sequence
@@ -11,14 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from bodyslam_jax.body import BodyModel, keypoints, local_joints, rest_joints
 from bodyslam_jax.body.skeleton import BODY25_TOES_AND_HEELS
 from bodyslam_jax.config import ContactTraining, MotionTraining
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.capture.clips import FPS, Clip, interleave, padded, resample
-from bodyslam_jax.motion.capture.contact_labels import standing_points
 from bodyslam_jax.motion.capture.retarget import Trial, place
 from bodyslam_jax.motion.contact_network import (
     ContactModel,
@@ -26,12 +31,25 @@ from bodyslam_jax.motion.contact_network import (
 )
 from bodyslam_jax.motion.network import normalisation
 from bodyslam_jax.motion.prediction import in_dtype, leg_length
-from bodyslam_jax.motion.training.noise import disturb
-from bodyslam_jax.motion.training.sampling import RATE_FACTOR, mirrored, posture_errors
+from bodyslam_jax.motion.training.sampling import (
+    RATE_FACTOR,
+    disturb,
+    mirrored,
+    posture_errors,
+)
 
 _FOOT_POINTS = np.array(BODY25_TOES_AND_HEELS)
 _NORMALISATION_BATCHES = 16
 """Number of batches from which means and standard deviations are computed."""
+MAX_CONTACT_SPEED = 0.35
+"""Speed below which a point is in contact, leg lengths per second (0.3 m/s)."""
+MAX_CONTACT_HEIGHT = 0.06
+"""Distance from the floor below which a point is in contact, leg lengths (5 cm)."""
+_FLOOR_WINDOW_S = 1.0
+"""Interval before and after a frame over which the floor is the median height of the
+lowest slow point, s: stairs and stools have their own height."""
+_SPEED_WINDOW_S = 1 / 15
+"""Interval over which speed is measured, s."""
 
 
 class ContactCorpus(eqx.Module):
@@ -207,3 +225,32 @@ def train_contact(
 
 _REPORT_UPDATES = 100
 """Number of updates between two reports."""
+
+
+def standing_points(
+    points: Float[np.ndarray, "t p 3"], fps: float
+) -> Bool[np.ndarray, "t p"]:
+    """Returns which points of both feet are in contact, in a world whose y axis is up.
+
+    `points` are heels and toes in leg lengths. Speed counts in all directions.
+    """
+    frame = np.arange(len(points))
+    half = max(1, round(_SPEED_WINDOW_S * fps / 2))
+    before = np.maximum(frame - half, 0)
+    after = np.minimum(frame + half, len(points) - 1)
+    moved = np.linalg.norm(points[after] - points[before], axis=-1)
+    slow = moved * fps / np.maximum(after - before, 1)[:, None] < MAX_CONTACT_SPEED
+    lowest = np.where(slow, points[..., 1], np.inf).min(axis=1)
+    floor = _running_median(lowest, round(_FLOOR_WINDOW_S * fps))
+    return slow & (np.abs(points[..., 1] - floor[:, None]) < MAX_CONTACT_HEIGHT)
+
+
+def _running_median(x: Float[np.ndarray, " t"], half: int) -> Float[np.ndarray, " t"]:
+    """Returns the median of the finite values within `half` rows; infinite without
+    any."""
+    padded = np.pad(x, half, constant_values=np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
+    ordered = np.sort(windows, axis=1)
+    count = np.isfinite(ordered).sum(axis=1)
+    middle = np.maximum(count - 1, 0) // 2
+    return np.where(count > 0, ordered[np.arange(len(x)), middle], np.inf)

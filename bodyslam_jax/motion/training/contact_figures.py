@@ -12,10 +12,10 @@ from bodyslam_jax.body import BodyModel, keypoints, rest_joints
 from bodyslam_jax.body.skeleton import BODY25_TOES_AND_HEELS
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
-from bodyslam_jax.motion.capture.contact_labels import standing_points
 from bodyslam_jax.motion.capture.retarget import place
 from bodyslam_jax.motion.contact_network import ContactModel, predict_contact
 from bodyslam_jax.motion.prediction import in_dtype, leg_length
+from bodyslam_jax.motion.training.contact import standing_points
 from bodyslam_jax.motion.training.evaluation import disturbed
 
 _FOOT_POINTS = np.array(BODY25_TOES_AND_HEELS)

@@ -13,8 +13,7 @@ from bodyslam_jax.motion.own_model import FunctionNetwork
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.prediction import MotionModel
-from bodyslam_jax.motion.training.evaluation import run_trials
-from bodyslam_jax.motion.training.measures import summary
+from bodyslam_jax.motion.training.evaluation import run_trials, summary
 
 DRIFTS_DEG = (0.0, 5.0, 9.0)
 """Standard deviations of slow joint-angle errors at which a model is evaluated,

@@ -16,8 +16,7 @@ from jaxtyping import Array, Float
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver.blocks import Linearisation
 from bodyslam_jax.solver.front import Pairs, Window
-from bodyslam_jax.solver.loops import row_of, with_row
-from bodyslam_jax.solver.triangular import half_of
+from bodyslam_jax.solver.triangular import half_of, row_of, with_row
 
 
 class Postures(eqx.Module):

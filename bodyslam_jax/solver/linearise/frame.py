@@ -21,8 +21,7 @@ from bodyslam_jax.graph import (
     squared_norm,
 )
 from bodyslam_jax.graph.factor import Key
-from bodyslam_jax.solver.blocks import Sums, shifted
-from bodyslam_jax.solver.posture import basis_of, to_coordinates
+from bodyslam_jax.solver.blocks import Sums, basis_of, shifted, to_coordinates
 
 _VARIABLE_ORDER = {"pose": 0, "root": 1, "camera": 2, "globals": 3}
 _GROUP_OF_VARIABLE = {

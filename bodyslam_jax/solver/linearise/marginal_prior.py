@@ -15,8 +15,14 @@ from jaxtyping import Array, Float, Int
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.graph import CHUNK, MarginalPrior, Problem, State
 from bodyslam_jax.graph.factors.marginal_prior import coordinates
-from bodyslam_jax.solver.blocks import PriorBlocks, Sizes, Sums, mask_of
-from bodyslam_jax.solver.posture import from_turns, to_coordinates
+from bodyslam_jax.solver.blocks import (
+    PriorBlocks,
+    Sizes,
+    Sums,
+    from_turns,
+    mask_of,
+    to_coordinates,
+)
 
 
 def linearise_marginal_prior(

@@ -8,8 +8,13 @@ from jaxtyping import Float
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.atomic import write_npz
 from bodyslam_jax.io.bodies.body_format import BodyFormat
-from bodyslam_jax.io.bodies.body_records import Rows, Video
-from bodyslam_jax.io.bodies.parts import PELVIS_SMPL, PELVIS_SMPLX, numbers_of
+from bodyslam_jax.io.bodies.parts import (
+    PELVIS_SMPL,
+    PELVIS_SMPLX,
+    Rows,
+    Video,
+    numbers_of,
+)
 from bodyslam_jax.io.formats import Source
 from bodyslam_jax.io.frame_index import InvalidContent
 

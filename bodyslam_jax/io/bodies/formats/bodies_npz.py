@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 
 from bodyslam_jax.io.bodies.body_format import BodyFormat
-from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.formats.amass import body_pose, is_smplx
 from bodyslam_jax.io.bodies.formats.weak_perspective import from_spin
 from bodyslam_jax.io.bodies.parts import (
     PELVIS_SMPL,
     PELVIS_SMPLX,
+    Rows,
+    Video,
     numbers_of,
     whole_of,
 )

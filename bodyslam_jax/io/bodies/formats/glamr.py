@@ -3,9 +3,10 @@
 import numpy as np
 
 from bodyslam_jax.io.bodies.body_format import BodyFormat
-from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import (
     PELVIS_SMPL,
+    Rows,
+    Video,
     at_size,
     betas_of,
     focals,

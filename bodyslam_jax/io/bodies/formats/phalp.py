@@ -3,14 +3,15 @@
 import numpy as np
 
 from bodyslam_jax.io.bodies.body_format import BodyFormat
-from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import (
+    Rows,
+    Video,
     as_rotvec,
     frames_of_images,
     middle,
     refocused,
+    turn_to_camera,
 )
-from bodyslam_jax.io.bodies.perspective import turn_to_camera
 from bodyslam_jax.io.declared_size import factor_to
 from bodyslam_jax.io.formats import Source
 from bodyslam_jax.io.frame_index import InvalidContent

@@ -11,9 +11,10 @@ import numpy as np
 
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.bodies.body_format import BodyFormat
-from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import (
     PELVIS_SMPL,
+    Rows,
+    Video,
     at_size,
     numbers_of,
     refocused,

@@ -3,10 +3,11 @@
 import numpy as np
 
 from bodyslam_jax.io.bodies.body_format import BodyFormat, diagonal
-from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import (
     PELVIS_SMPL,
     PELVIS_SMPLX,
+    Rows,
+    Video,
     as_rotvec,
     at_size,
     focals,

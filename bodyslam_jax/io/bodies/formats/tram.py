@@ -7,8 +7,9 @@ import numpy as np
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.bodies.body_format import BodyFormat, diagonal
-from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import (
+    Rows,
+    Video,
     as_rotvec,
     betas_of,
     frames_of,

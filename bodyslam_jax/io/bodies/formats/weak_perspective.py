@@ -3,8 +3,9 @@
 import numpy as np
 
 from bodyslam_jax.io.bodies.body_format import BodyFormat
-from bodyslam_jax.io.bodies.body_records import Rows, Video
 from bodyslam_jax.io.bodies.parts import (
+    Rows,
+    Video,
     betas_of,
     frames_of,
     from_crops,

@@ -3,8 +3,7 @@
 import numpy as np
 
 from bodyslam_jax.io.bodies.body_format import BodyFormat, diagonal
-from bodyslam_jax.io.bodies.body_records import Rows, Video
-from bodyslam_jax.io.bodies.parts import betas_of, frames_of, numbers_of
+from bodyslam_jax.io.bodies.parts import Rows, Video, betas_of, frames_of, numbers_of
 from bodyslam_jax.io.formats import Source
 from bodyslam_jax.types import Intrinsics
 

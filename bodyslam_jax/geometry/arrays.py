@@ -1,6 +1,13 @@
-"""Sums of rows that share an index, as in block-wise normal equations."""
+"""Operations on arrays: runs of true entries, and sums of rows that share an index."""
 
 import numpy as np
+from jaxtyping import Bool
+
+
+def runs(present: Bool[np.ndarray, " t"]) -> list[slice]:
+    """Returns the maximal runs of consecutive true entries of `present`, as slices."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], present, [False]])))
+    return [slice(a, b) for a, b in edges.reshape(-1, 2)]
 
 
 def sum_by(index: np.ndarray, values: np.ndarray, num: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Prepares the processes of an engine."""
+"""Makes the engine that settings name, and prepares its processes."""
 
 import dataclasses
 import functools
@@ -7,7 +7,8 @@ import os
 from typing import Any
 
 from bodyslam_jax.batch import program_cache
-from bodyslam_jax.batch.engine import Setup
+from bodyslam_jax.batch.engine import Engine, Setup
+from bodyslam_jax.config import Distribution
 
 _JAX_OPTIONS = (
     "jax_enable_x64",
@@ -16,6 +17,34 @@ _JAX_OPTIONS = (
     "jax_persistent_cache_min_compile_time_secs",
     "jax_persistent_cache_min_entry_size_bytes",
 )
+
+
+def make_engine(distribution: Distribution, folder: Any, gpu: bool) -> Engine:
+    """Returns the engine that the settings name.
+
+    Args:
+        folder: folder for the engine's own files, accessible from all machines.
+        gpu: whether GPUs are used if there are any.
+    """
+    if distribution.engine == "ray":
+        from bodyslam_jax.batch.ray_engine import RayEngine
+
+        return RayEngine(
+            distribution.workers, distribution.retries, distribution.ray_address, gpu
+        )
+    if distribution.engine == "slurm":
+        from bodyslam_jax.batch.slurm_engine import SlurmEngine
+
+        return SlurmEngine(
+            folder,
+            distribution.workers,
+            distribution.retries,
+            distribution.slurm_minutes,
+            distribution.slurm_parameters(),
+        )
+    from bodyslam_jax.batch.local_engine import LocalEngine
+
+    return LocalEngine(distribution.workers, distribution.retries, gpu)
 
 
 @dataclasses.dataclass(frozen=True)
