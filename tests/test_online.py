@@ -310,6 +310,30 @@ def test_a_file_runs_at_its_own_pace_and_the_newest_image_wins(clip):
     assert [i.timestamp for i in found] == pytest.approx([k / 30 for k in indices])
 
 
+def test_a_file_waits_for_who_wants_every_frame_of_it(clip):
+    capture = Capture(str(clip), every=True)
+    assert capture.length == 24
+    capture.start()
+    found = []
+    while (image := capture.newest(timeout=5.0)) is not None:
+        found.append(image)
+        time.sleep(0.05)  # slower than the source
+    capture.close()
+    assert capture.dropped == 0
+    assert [image.index for image in found] == list(range(24))
+    assert [i.timestamp for i in found] == pytest.approx([k / 30 for k in range(24)])
+    with pytest.raises(InputError, match="--every-frame: 0 is no file"):
+        Capture("0", every=True)
+
+
+def test_a_file_that_waits_can_be_closed_before_its_end(clip):
+    capture = Capture(str(clip), every=True)
+    capture.start()
+    assert capture.newest(timeout=5.0) is not None
+    capture.close()  # the thread waits to be relieved of the second image
+    assert capture.ended
+
+
 @pytest.mark.parametrize(
     ("source", "words"),
     [

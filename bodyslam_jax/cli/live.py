@@ -33,6 +33,7 @@ def live(
     page: bool = True,
     port: int = 0,
     open: bool = False,
+    every_frame: bool = False,
     smooth: bool = False,
     preset: Preset = "default",
     settings: Path | None = None,
@@ -52,6 +53,9 @@ def live(
         page: Whether a page is served; without it, progress is told in lines.
         port: Port of the page; 0 takes a free one.
         open: Open the page in the default browser.
+        every_frame: Read a file as fast as its frames are estimated, in place of its
+            own pace: none is dropped, and the same file gives the same estimate. For
+            videos that are too long for `run`, as memory does not grow.
         smooth: After the end estimate everything once more, offline, from the points
             and keypoints that were recorded; it takes as long as `run` without its
             images.
@@ -69,7 +73,7 @@ def live(
     from bodyslam_jax.pipeline.progress import compiling
 
     _check(config)
-    capture = Capture(source, config.fps)
+    capture = Capture(source, config.fps, every=every_frame)
     try:
         intrinsics = None if camera is None else read_camera(camera, capture.size)[0]
         name = _name(source)
@@ -79,6 +83,7 @@ def live(
             config,
             intrinsics=intrinsics,
             fps=capture.fps,
+            threads=not every_frame,
             name=name,
             smooth=smooth,
         )
@@ -202,6 +207,9 @@ def _follow(capture: Any, online: Any, page: Any, stop: Any) -> list[int]:
         late = sorted(latencies)[int(0.95 * (len(latencies) - 1))]
         rate = len(indices) / max(now - begun, 1e-9)
         figures = _figures(estimate, rate, late, capture.dropped)
+        if capture.every and capture.length is not None:
+            left = max(capture.length - len(indices), 0) / max(rate, 1e-9)
+            figures["time left"] = f"{left:.0f} s"
         if page is not None and now - drawn >= _PICTURE_INTERVAL_S:
             drawn = now
             page.show(

@@ -371,5 +371,6 @@ def check_memory(layout: Layout, state: State, pose: int) -> None:
         fit = max((x for x in LENGTHS if x <= most), default=most)
         raise InputError(
             f"{len(state.cameras)} frames need about {need / 2**30:.1f} GiB, found "
-            f"{have / 2**30:.1f} GiB: about {fit} frames fit."
+            f"{have / 2**30:.1f} GiB: about {fit} frames fit. The memory of bodyslam "
+            "live VIDEO --every-frame does not grow with frames."
         )

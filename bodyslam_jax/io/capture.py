@@ -1,7 +1,8 @@
-"""A running source of images: a video file at its own pace, a camera, a stream.
+"""A running source of images: a video file, a camera, a stream.
 
 A thread reads; of what it reads only the newest image is kept, so that whoever is too
-slow sees fewer images, never older ones.
+slow sees fewer images, never older ones. A file may also be read at the pace of whoever
+takes its images: then none is dropped.
 """
 
 import dataclasses
@@ -40,15 +41,25 @@ class Captured:
 class Capture:
     """A source and the thread that reads it, until `close`."""
 
-    def __init__(self, source: str, fps: float | None = None) -> None:
+    def __init__(
+        self, source: str, fps: float | None = None, *, every: bool = False
+    ) -> None:
         """
         **Arguments:** `source`: a video file, the number of a camera, or the address of
-        a stream that OpenCV opens; `fps` in place of the rate that it tells.
+        a stream that OpenCV opens; `fps` in place of the rate that it tells; `every`:
+        whether the thread waits until each image of a file was taken, in place of
+        reading at the file's own pace.
 
-        **Raises:** `InputError` if it cannot be opened or gives no image.
+        **Raises:** `InputError` if it cannot be opened or gives no image, or if `every`
+        is asked for of a camera or a stream, which do not wait.
         """
         self.source = source
         self.path = _file(source)
+        if every and self.path is None:
+            raise InputError(
+                f"--every-frame: {source} is no file, and does not wait for anybody."
+            )
+        self.every = every
         self.reader = self._open()
         told = float(self.reader.get(cv2.CAP_PROP_FPS) or 0.0)
         usual = told if 0 < told <= _MAX_FPS else _DEFAULT_FPS
@@ -59,6 +70,9 @@ class Capture:
             raise InputError(f"{source}: opened, but gives no image.")
         self.size = first.shape[1], first.shape[0]
         self.first: np.ndarray | None = first
+        told = float(self.reader.get(cv2.CAP_PROP_FRAME_COUNT) or 0.0)
+        self.length = int(told) if self.path is not None and told > 0 else None
+        """Number of images of a file, as its header tells it."""
         self.dropped = 0
         """Images that were replaced by newer ones before anybody took them."""
         self.ended = False
@@ -82,6 +96,7 @@ class Capture:
             there = lambda: self._newest is not None or self.ended
             self._ready.wait_for(there, timeout)
             found, self._newest = self._newest, None
+            self._ready.notify_all()
             return found
 
     def silent(self) -> float:
@@ -90,7 +105,9 @@ class Capture:
 
     def close(self) -> None:
         """Ends the thread; a thread that waits for a camera ends with the process."""
-        self._closed = True
+        with self._ready:
+            self._closed = True
+            self._ready.notify_all()
         if self._thread is not None:
             self._thread.join(timeout=1.0)
             if self._thread.is_alive():
@@ -116,7 +133,10 @@ class Capture:
         self.first = None
         while image is not None and not self._closed:
             timestamp = index / self.fps
-            if self.path is not None:
+            if self.every:
+                with self._ready:
+                    self._ready.wait_for(lambda: self._newest is None or self._closed)
+            elif self.path is not None:
                 wait = begun + timestamp - time.monotonic()
                 if wait > 0:
                     time.sleep(wait)
