@@ -8,8 +8,11 @@ from typing import Any
 from bodyslam_jax import evaluation
 
 
-def error_tables(errors: Mapping[str, Mapping[str, Any]]) -> str:
-    """Returns the errors against the truth, with one column per evaluated estimate."""
+def error_tables(
+    errors: Mapping[str, Mapping[str, Any]], sentences: Sequence[str] = ()
+) -> str:
+    """Returns the errors against the truth, with one column per evaluated estimate, and
+    the sentences below the main ones."""
     if not errors:
         return ""
     first = [row for row in evaluation.ROWS if row[0] in _MAIN_ERRORS]
@@ -19,6 +22,7 @@ def error_tables(errors: Mapping[str, Mapping[str, Any]]) -> str:
         "<p>Means over all frames. SE(3) alignment keeps the estimated size; Sim(3) "
         "corrects it by the truth, which is unknown outside of benchmarks.</p>"
         f"{_error_table(errors, first)}"
+        f"{''.join(f'<p>{html.escape(line)}</p>' for line in sentences)}"
         f"{folded('More errors', _error_table(errors, others))}</section>"
     )
 
