@@ -1,5 +1,6 @@
 import contextlib
 import importlib.metadata
+import inspect
 import io
 import json
 import os
@@ -50,6 +51,9 @@ def test_help_says_what_the_tool_does_and_its_commands(monkeypatch, capsys):
     assert code == 0 and "in metres" in out and "bodyslam demo" in out
     for command in ("run", "demo", "evaluate", "body-model", "doctor"):
         assert f"\n  {command} " in out
+    for command in cli.COMMANDS.values():
+        first, *rest = inspect.getdoc(command.function).splitlines()
+        assert not (rest and rest[0]), f"the list of commands has a part: {first}"
     code, out, _ = _run(monkeypatch, capsys, "body-model", "--help")
     assert code == 0 and "SMPL" in out and "\n  convert " in out
     assert _run(monkeypatch, capsys)[0] == 2

@@ -12,6 +12,7 @@ from scipy.signal import savgol_filter
 from bodyslam_jax import export, view
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.diagnostics import statistics, thresholds
+from bodyslam_jax.evaluation import before_after
 from bodyslam_jax.export.figures import person_variable
 from bodyslam_jax.export.report import in_plain_words
 from bodyslam_jax.types import Result
@@ -354,3 +355,17 @@ def test_reasons_lead_to_their_frames_in_the_overlay(tmp_path, body):
     text = (tmp_path / "report.html").read_text()
     assert '<a href="overlay.webm#t=1.03,1.53">Look at frames 31 to 43' in text
     assert "x grows to the left" in text
+
+
+def test_errors_end_with_both_statures_and_what_the_height_alone_would_give(
+    tmp_path, body
+):
+    errors = {before_after.JOINT_ESTIMATE: {"scale": 1.1, "h_ate_se3": 0.2}}
+    result = dataclasses.replace(_walk(), summary=SUMMARY | {"errors": errors})
+    truth = before_after.TruthBeside(
+        result.T_WC[:, :3, 3], result.joints[:, :, 0], {0: (1.84, 1.67)}
+    )
+    export.write_report(tmp_path / "report.html", result, body, None, truth)
+    text = (tmp_path / "report.html").read_text()
+    assert "person 0: 167 cm, in truth 184 cm" in text
+    assert "by the height alone (--height 1.84) they would be by +0.2 %" in text

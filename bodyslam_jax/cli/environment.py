@@ -15,8 +15,7 @@ _CODECS = {"VP90": ".webm", "mp4v": ".mp4", "MJPG": ".avi"}
 
 
 def doctor() -> None:
-    """Prints versions, devices, codecs, networks and body models of this machine, and
-    what of `bodyslam` works with them."""
+    """Prints versions, devices, networks and body models, and what works with them."""
     rows = report()
     rows.append(("verdict", verdict(rows)))
     width = max(len(name) for name, _ in rows)

@@ -107,8 +107,15 @@ def headline(
         ]
         if parts:
             lines.append(f"error of {name}: {'; '.join(parts)}")
+    return lines + (sizes(errors, truth) if truth else [])
+
+
+def sizes(errors: dict[str, dict[str, float | str]], truth: TruthBeside) -> list[str]:
+    """Returns, for each person, a line with both statures, and a line with the error of
+    lengths and what it would be if the stature had been given."""
+    lines = []
     scale = errors.get(JOINT_ESTIMATE, {}).get("scale")
-    for person, (true, found) in truth.statures.items() if truth else ():
+    for person, (true, found) in truth.statures.items():
         lines.append(
             f"person {person}: {100 * found:.0f} cm, in truth {100 * true:.0f} cm"
         )

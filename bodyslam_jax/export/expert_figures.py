@@ -129,8 +129,11 @@ def focal_length(lens: Mapping[str, Any]) -> str:
     return f"<p>{text}</p>"
 
 
-def error_tables(errors: Mapping[str, Mapping[str, Any]]) -> str:
-    """Returns the errors against the truth, with one column per evaluated estimate."""
+def error_tables(
+    errors: Mapping[str, Mapping[str, Any]], sentences: Sequence[str] = ()
+) -> str:
+    """Returns the errors against the truth, with one column per evaluated estimate, and
+    the sentences below the main ones."""
     if not errors:
         return ""
     first = [row for row in evaluation.ROWS if row[0] in _MAIN_ERRORS]
@@ -140,6 +143,7 @@ def error_tables(errors: Mapping[str, Mapping[str, Any]]) -> str:
         "<p>Means over all frames. SE(3) alignment keeps the estimated size; Sim(3) "
         "corrects it by the truth, which is unknown outside of benchmarks.</p>"
         f"{_error_table(errors, first)}"
+        f"{''.join(f'<p>{html.escape(line)}</p>' for line in sentences)}"
         f"{folded('More errors', _error_table(errors, others))}</section>"
     )
 

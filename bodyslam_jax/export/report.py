@@ -20,7 +20,7 @@ from bodyslam_jax.diagnostics.statistics import (
     camera_statistics,
     person_statistics,
 )
-from bodyslam_jax.evaluation.before_after import TruthBeside
+from bodyslam_jax.evaluation.before_after import TruthBeside, sizes
 from bodyslam_jax.export import figures
 from bodyslam_jax.export.answers import along_view, answers
 from bodyslam_jax.export.expert_figures import (
@@ -131,7 +131,7 @@ def write_report(
 
     Overlay and scene are shown if they are in the folder of `path`. `still` is one
     frame of the overlay (JPEG), which is embedded in the report. The paths and statures
-    of `truth` are shown beside the estimate's.
+    of `truth` are shown beside the estimate's, and what the stature alone would give.
     """
     summary = plain(result.summary)
     camera = camera_statistics(result)
@@ -145,7 +145,7 @@ def write_report(
         _reasons(summary, len(people), _overlay(path.parent)),
         _plots(result, summary, camera, people, truth),
         _warnings(summary.get("warnings") or []),
-        _details(result, summary, people, body),
+        _details(result, summary, people, body, truth),
     ]
     style = resources.files("bodyslam_jax.export").joinpath("report.css").read_text()
     path.write_text(
@@ -393,6 +393,7 @@ def _details(
     summary: Mapping[str, Any],
     people: Sequence[PathStatistics],
     body: BodyModel,
+    truth: TruthBeside | None,
 ) -> str:
     """Returns the details for experts, folded except for errors against a truth."""
     labels = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
@@ -416,8 +417,9 @@ def _details(
             text = yaml.safe_dump(found, sort_keys=False)
             contents[title] = f"<pre>{html.escape(text)}</pre>"
     parts = [folded(title, text) for title, text in contents.items() if text]
-    errors = error_tables(summary.get("errors") or {})
-    return f"{errors}<section><h2>For experts</h2>{''.join(parts)}</section>"
+    errors = summary.get("errors") or {}
+    compared = error_tables(errors, sizes(errors, truth) if truth else ())
+    return f"{compared}<section><h2>For experts</h2>{''.join(parts)}</section>"
 
 
 def _own(summary: Mapping[str, Any]) -> str:
