@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax import evaluation, io, view
-from bodyslam_jax.batch import record, rows, table
+from bodyslam_jax.batch import record, rows
 from bodyslam_jax.batch.inputs import read_manifest
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.cli.settings import read_settings
@@ -120,8 +120,8 @@ def _batch(path: Path) -> Any:
     home = path.parents[2] if path.parent.parent.name == "runs" else path.parent
     found = rows.read_rows(home)
     assert any(row["name"] == "whole" and row["status"] == "ok" for row in found)
-    columns = table.present(rows.columns(), found)
-    forms = (table.to_csv, table.to_markdown, table.to_latex)
+    columns = rows.present(rows.columns(), found)
+    forms = (rows.to_csv, rows.to_markdown, rows.to_latex)
     texts = [form(columns, found) for form in forms]
     return [{k: v for k, v in row.items()} for row in found], texts
 

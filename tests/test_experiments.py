@@ -31,8 +31,12 @@ from bodyslam_jax.experiments import (
 from bodyslam_jax.experiments.ablation import shake
 from bodyslam_jax.experiments.jobs import Journal, fits
 from bodyslam_jax.experiments.plans import PLANS
-from bodyslam_jax.experiments.scenario import simulations, with_scale
-from bodyslam_jax.experiments.scoring import NAMES, PLAUSIBILITY_FIGURES
+from bodyslam_jax.experiments.scenario import (
+    NAMES,
+    PLAUSIBILITY_FIGURES,
+    simulations,
+    with_scale,
+)
 from bodyslam_jax.pipeline.case import trajectories
 
 SHORT = (solver.Stage(("scale", "roots"), max_steps=8),)

@@ -14,10 +14,9 @@ from importlib import resources
 from pathlib import Path
 from urllib.parse import quote
 
-from bodyslam_jax.batch import plots, rows, table
+from bodyslam_jax.batch import plots, rows
 from bodyslam_jax.batch.inputs import RUNS_FOLDER
-from bodyslam_jax.batch.rows import STATUS_ORDER
-from bodyslam_jax.batch.table import Column, Row
+from bodyslam_jax.batch.rows import STATUS_ORDER, Column, Row
 from bodyslam_jax.config.errors import InputError, error_line
 from bodyslam_jax.io import atomic
 
@@ -43,7 +42,7 @@ def collect(folder: str | Path) -> list[Path]:
                 f"move run folders into {folder / RUNS_FOLDER}."
             )
     found = rows.read_rows(folder)
-    columns = table.present(rows.columns(), found)
+    columns = rows.present(rows.columns(), found)
     written = write_tables(folder, columns, found)
     plots.draw(folder / "plots.png", found, columns)
     write_index(folder, found, columns, _thumbnails(folder, found))
@@ -51,20 +50,20 @@ def collect(folder: str | Path) -> list[Path]:
 
 
 def write_tables(
-    folder: Path, columns: list[table.Column], found: list[table.Row]
+    folder: Path, columns: list[rows.Column], found: list[rows.Row]
 ) -> list[Path]:
     """Writes a table in three formats, and returns their paths."""
     forms = {
-        "csv": table.to_csv,
-        "md": table.to_markdown,
-        "tex": table.to_latex,
+        "csv": rows.to_csv,
+        "md": rows.to_markdown,
+        "tex": rows.to_latex,
     }
     for suffix, form in forms.items():
         atomic.write_text(folder / f"table.{suffix}", form(columns, found))
     return [folder / f"table.{suffix}" for suffix in forms]
 
 
-def _thumbnails(folder: Path, found: list[table.Row]) -> dict[str, str]:
+def _thumbnails(folder: Path, found: list[rows.Row]) -> dict[str, str]:
     """Writes still images of the overlays, and returns their paths by the clip's
     name."""
     from bodyslam_jax.view.video_file import write_thumbnail

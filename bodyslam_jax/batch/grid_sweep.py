@@ -14,9 +14,8 @@ from bodyslam_jax.batch.collection import write_tables
 from bodyslam_jax.batch.engine import Engine, Failure, Setup
 from bodyslam_jax.batch.grid import Axis, at_point, mapped_points, settings_points
 from bodyslam_jax.batch.inputs import Input, find_inputs
-from bodyslam_jax.batch.rows import error_columns
+from bodyslam_jax.batch.rows import Column, Row, error_columns, present
 from bodyslam_jax.batch.sweep_job import ERRORS, SweepJob, run_sweep
-from bodyslam_jax.batch.table import Column, Row, present
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic, files

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bodyslam_jax.batch.grid import Axis
-from bodyslam_jax.batch.rows import STATUS_ORDER
-from bodyslam_jax.batch.table import Column, Row
+from bodyslam_jax.batch.rows import STATUS_ORDER, Column, Row
 
 _STATUS_COLOURS: dict[str, str] = dict(
     zip(

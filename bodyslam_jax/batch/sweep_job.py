@@ -12,7 +12,7 @@ import numpy as np
 from bodyslam_jax import diagnostics, evaluation, graph, io, people, solver
 from bodyslam_jax.batch.grid import SCALE
 from bodyslam_jax.batch.inputs import Input
-from bodyslam_jax.batch.table import Row
+from bodyslam_jax.batch.rows import Row
 from bodyslam_jax.body import BodyModel, load_body_model
 from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics.statistics import camera_statistics

@@ -20,10 +20,10 @@ from bodyslam_jax.experiments.comparison import depth_scale as depth_scale
 from bodyslam_jax.experiments.scale import PERTURBATIONS as PERTURBATIONS
 from bodyslam_jax.experiments.scale import ScaleRecovery as ScaleRecovery
 from bodyslam_jax.experiments.scale import scale_recovery as scale_recovery
+from bodyslam_jax.experiments.scenario import errors as errors
+from bodyslam_jax.experiments.scenario import score as score
 from bodyslam_jax.experiments.scenario import score_of as score_of
 from bodyslam_jax.experiments.scenario import without_map as without_map
-from bodyslam_jax.experiments.scoring import errors as errors
-from bodyslam_jax.experiments.scoring import score as score
 from bodyslam_jax.experiments.weights import WEIGHTS as WEIGHTS
 from bodyslam_jax.experiments.weights import Learned as Learned
 from bodyslam_jax.experiments.weights import Trial as Trial

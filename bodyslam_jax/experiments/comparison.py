@@ -14,8 +14,7 @@ from bodyslam_jax import evaluation, graph, people
 from bodyslam_jax.body.skeleton import BODY25_ANKLES
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.experiments.ablation import as_published
-from bodyslam_jax.experiments.scenario import score_of, with_scale, without_map
-from bodyslam_jax.experiments.scoring import NAMES
+from bodyslam_jax.experiments.scenario import NAMES, score_of, with_scale, without_map
 from bodyslam_jax.initialisation import first_state
 from bodyslam_jax.pipeline.case import Case, trajectories
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet

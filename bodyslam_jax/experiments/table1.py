@@ -8,7 +8,7 @@ from typing import Any
 
 from bodyslam_jax.experiments import figures, paper
 from bodyslam_jax.experiments.comparison import METHODS
-from bodyslam_jax.experiments.scoring import NAMES, PLAUSIBILITY_FIGURES
+from bodyslam_jax.experiments.scenario import NAMES, PLAUSIBILITY_FIGURES
 from bodyslam_jax.experiments.tables import (
     MM,
     Column,

@@ -26,8 +26,7 @@ from bodyslam_jax.body import KEYPOINT_NAMES
 from bodyslam_jax.body.skeleton import KEYPOINT_JOINT, SURFACE_POINTS
 from bodyslam_jax.config import Config, Experiment, Simulation
 from bodyslam_jax.experiments.jobs import COMPILATION_S, Job, Row, named
-from bodyslam_jax.experiments.scenario import simulations
-from bodyslam_jax.experiments.scoring import leg_of
+from bodyslam_jax.experiments.scenario import leg_of, simulations
 from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint
 from bodyslam_jax.simulation import OTHER, RECORDINGS, SimulatedSequence
 from bodyslam_jax.simulation.point_tracks import is_behind

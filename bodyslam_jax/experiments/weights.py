@@ -22,8 +22,7 @@ from jaxtyping import Array, Float
 from bodyslam_jax import evaluation, graph, solver
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config.errors import InputError, error_line
-from bodyslam_jax.experiments.scenario import without_map
-from bodyslam_jax.experiments.scoring import errors
+from bodyslam_jax.experiments.scenario import errors, without_map
 from bodyslam_jax.pipeline import stage_cache
 from bodyslam_jax.pipeline.case import Case, trajectories
 from bodyslam_jax.pipeline.joint_problem import Prepared

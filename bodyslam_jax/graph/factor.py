@@ -6,7 +6,8 @@ A residual is prediction minus measurement in standard deviations, so that
 person (`frame_residual`), with the variables it depends on (`keys`); the residuals of
 all frames and the blocks of the Jacobian follow from that.
 
-The array fields of a module and the axes that their jaxtyping annotations name.
+Which fields of a factor are measurements, and over which axes, is read from their
+jaxtyping annotations (`fields_with_axes`).
 """
 
 import abc

@@ -1,18 +1,18 @@
-"""Keypoints of one person in one frame with their derivatives, in closed form.
+"""Keypoints of one person in one frame with their first and second
+derivatives, in closed form.
 
 A keypoint is a weighted sum of points fixed to joints, `p = Σ_i w_i (x_i + G_i a_i)`. A
 rotation `R_j Exp(δ_j)` of joint j moves all joints below it:
 `dp/dδ_j = -[Σ_{i below j} w_i (x_i + G_i a_i - x_j)]x G_j`, plus the derivative of pose
 blend shapes. Forward differentiation of the chain takes twenty times as long.
 
-Second derivatives of keypoints by joint rotations, in closed form.
-
-They matter because the image of a limb that lies across the view does not change, to
-first order, as it rotates towards the camera. A rotation of joint i about an axis `a`
-(in H) moves all joints below it, and so rotates the derivatives `d_j` by them:
-`∂²p/∂δ_i∂δ_j = a x d_j`, and for i = j its symmetric part. With `d_j = b x m_j`, where
-`m_j` is the offset of a point below j, the contraction with gradients `f` is
-`Σ f·(a x (b x m_j)) = a·(M_j b - b tr M_j)`, `M_j = Σ m_j f^T`: nine numbers a joint.
+Second derivatives by joint rotations matter because the image of a limb that lies
+across the view does not change, to first order, as it rotates towards the camera. A
+rotation of joint i about an axis `a` (in H) moves all joints below it, and so rotates
+the derivatives `d_j` by them: `∂²p/∂δ_i∂δ_j = a x d_j`, and for i = j its symmetric
+part. With `d_j = b x m_j`, where `m_j` is the offset of a point below j, the
+contraction with gradients `f` is `Σ f·(a x (b x m_j)) = a·(M_j b - b tr M_j)`, `M_j = Σ
+m_j f^T`: nine numbers a joint.
 """
 
 from typing import NamedTuple

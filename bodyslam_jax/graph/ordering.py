@@ -9,12 +9,10 @@ length of the video. Chunks are then sorted by the second eigenvector of the Lap
 of their covisibility graph (S. Barnard, A. Pothen, H. Simon, A spectral algorithm for
 envelope reduction of sparse matrices, 1993). Runs in NumPy when a problem is made.
 
-Selects the landmarks with long tracks, which are eliminated with the globals.
-
 The longest track determines the bandwidth of the reduced camera matrix. A few
 landmarks that are observed much longer than all others are therefore eliminated after
-the cameras: they widen the arrow of the globals, and the band becomes as narrow as the
-other landmarks allow. Runs in NumPy when a problem is made.
+the cameras, with the globals (`choose_long_tracks`): they widen the arrow of the
+globals, and the band becomes as narrow as the other landmarks allow.
 """
 
 from typing import NamedTuple

@@ -33,8 +33,8 @@ from bodyslam_jax.motion.resampling import predict_between as predict_between
 from bodyslam_jax.motion.scale import Scale as Scale
 from bodyslam_jax.motion.scale import scale_from_motion as scale_from_motion
 from bodyslam_jax.motion.training.command import train_from_data as train_from_data
+from bodyslam_jax.motion.training.contact import judge_contact as judge_contact
 from bodyslam_jax.motion.training.contact import train_contact as train_contact
-from bodyslam_jax.motion.training.contact_figures import judge_contact as judge_contact
 from bodyslam_jax.motion.training.evaluation import evaluate_model as evaluate_model
 from bodyslam_jax.motion.training.figures import compare as compare
 from bodyslam_jax.motion.training.figures import draw_errors as draw_errors

@@ -3,6 +3,6 @@
 All are subclasses of `graph.factor.FrameFactor`, except those of landmarks. Factors are
 created from measurements in `initialisation`: those of people in
 `people_factors.py`, of the motion model in `motion_factors.py`, of cameras and
-landmarks in `map_factors.py`, of the ground in `ground.py` and of trunks in
-`upright.py`; those of intrinsics in `pipeline/bundle_adjustment.py`.
+landmarks in `map_factors.py` and of the ground in `ground.py`; those of intrinsics in
+`pipeline/bundle_adjustment.py`.
 """

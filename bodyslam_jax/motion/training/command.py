@@ -11,8 +11,8 @@ from bodyslam_jax.config import MotionTraining
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.motion.capture.clips import split
 from bodyslam_jax.motion.capture.readers import read_motion
+from bodyslam_jax.motion.training.evaluation import kept, named
 from bodyslam_jax.motion.training.figures import draw_history
-from bodyslam_jax.motion.training.selection import kept, named
 from bodyslam_jax.motion.training.train import train
 from bodyslam_jax.motion.weights import save_motion_model
 

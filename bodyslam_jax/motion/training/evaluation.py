@@ -3,6 +3,9 @@
 Errors of predicted displacements are measured by their size, bias, spread, calibration
 and correlation. The slope is the projection of predicted on true displacement: it is 1
 without bias, and its relative error is that of a scale estimated with the model.
+
+Validation during training takes the same errors (`validated`) and selects the epoch
+whose weights are kept (`kept`).
 """
 
 from collections.abc import Sequence
@@ -19,6 +22,9 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
 from bodyslam_jax.motion.capture.retarget import Trial, place
+from bodyslam_jax.motion.own_model import FunctionNetwork
+from bodyslam_jax.motion.paper_network import PaperNetwork
+from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.prediction import MotionModel, Prediction, in_dtype, predict
 from bodyslam_jax.motion.training.sampling import disturb, drift
 
@@ -28,6 +34,11 @@ LAGS_FRAMES = (1, 2, 4, 8, 15, 30)
 """Time lags at which the correlation of errors is measured, frames."""
 _CHI2_95 = 7.815
 """95 % quantile of the chi-square distribution with 3 degrees of freedom."""
+DRIFTS_DEG = (0.0, 5.0, 9.0)
+"""Standard deviations of slow joint-angle errors at which a model is evaluated,
+degrees."""
+TARGET_RATIOS = (0.10, 0.13, 0.18)
+"""Target ratio of error to displacement at each drift."""
 
 
 @eqx.filter_jit
@@ -303,3 +314,62 @@ def _longer(
         -1
     )
     return sums[whole]
+
+
+def validated(
+    model: MotionModel, body: BodyModel, trials: Sequence[Trial]
+) -> Float[np.ndarray, " 6"]:
+    """Returns the mean error over the mean step length at each of `DRIFTS_DEG`, then
+    the slope (projection of predicted on true displacement) at each."""
+    runs = [summary(run_trials(model, body, trials, d)) for d in DRIFTS_DEG]
+    return np.array([run[k] for k in ("ratio", "slope") for run in runs])
+
+
+def named(row: Float[np.ndarray, " 6"]) -> dict[str, float]:
+    """Names the values that `validated` returns."""
+    names = [f"{what} at {d:g}°" for what in ("ratio", "slope") for d in DRIFTS_DEG]
+    return dict(zip(names, map(float, row), strict=True))
+
+
+def kept(history: Float[np.ndarray, "e 7"], drift_deg: float) -> int | None:
+    """Returns the epoch, from 0, whose weights were kept; `None` without validation."""
+    scores = np.array([score(row, drift_deg) for row in history[:, 1:]])
+    return None if np.isnan(scores).all() else int(np.nanargmin(scores))
+
+
+def score(row: Float[np.ndarray, " 6"], drift_deg: float) -> float:
+    """Returns the validation score, lower for better models, from errors relative to
+    their targets and from slopes, at the drifts used in training."""
+    trained = np.array(DRIFTS_DEG) <= drift_deg
+    errors, bias = row[:3] / TARGET_RATIOS, np.abs(row[3:] - 1)
+    return float(np.mean(errors[trained]) + 5 * np.mean(bias[trained]))
+
+
+def calibrated(
+    model: MotionModel, body: BodyModel, trials: Sequence[Trial]
+) -> MotionModel:
+    """Scales the predicted covariance so that the mean squared whitened error per axis
+    (NEES / 3) is 1 over `trials` at all `DRIFTS_DEG`.
+
+    The paper's network predicts no covariance; that of its errors is used as a
+    constant.
+    """
+    runs = [run_trials(model, body, trials, d) for d in DRIFTS_DEG]
+    error = np.concatenate([(r.predicted - r.true)[r.valid] for r in runs]).astype(
+        float
+    )
+    if isinstance(model.network, PaperNetwork):
+        spread = np.linalg.cholesky(error.T @ error / len(error) + 1e-10 * np.eye(3))
+        new = jnp.asarray(spread, jnp.float32)
+        return eqx.tree_at(lambda m: m.network.spread, model, new)
+    if not isinstance(model.network, MetricNetwork | FunctionNetwork):
+        return model
+    covariance = np.concatenate([r.covariance[r.valid] for r in runs]).astype(float)
+    nees = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1) / 3
+    if isinstance(model.network, FunctionNetwork):
+        spread = model.network.spread * float(np.sqrt(nees.mean()))
+        return eqx.tree_at(lambda m: m.network.spread, model, spread)
+    factor = 0.5 * np.log(nees.mean())
+    bias = lambda m: [layers[-1].bias for layers in m.network.spreads]
+    shift = jnp.asarray([factor] * 3 + [0.0] * 3, jnp.float32)
+    return eqx.tree_at(bias, model, [b + shift for b in bias(model)])

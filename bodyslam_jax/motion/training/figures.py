@@ -15,11 +15,12 @@ from bodyslam_jax.motion.capture.retarget import place
 from bodyslam_jax.motion.continuation import Rollout
 from bodyslam_jax.motion.prediction import MotionModel
 from bodyslam_jax.motion.training.evaluation import (
+    DRIFTS_DEG,
+    TARGET_RATIOS,
     baseline_mean,
     evaluate_model,
     run_trials,
 )
-from bodyslam_jax.motion.training.selection import DRIFTS_DEG, TARGET_RATIOS
 
 COLUMNS = (
     "error_mm step_mm ratio slope slope_30 spread nees coverage_95 corr_1 corr_30 "

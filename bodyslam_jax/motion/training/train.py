@@ -48,8 +48,8 @@ from bodyslam_jax.motion.own_model import FunctionNetwork
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork
 from bodyslam_jax.motion.prediction import MotionModel, in_dtype
+from bodyslam_jax.motion.training.evaluation import calibrated, named, score, validated
 from bodyslam_jax.motion.training.sampling import Batch, Corpus, corpus, draw
-from bodyslam_jax.motion.training.selection import calibrated, named, score, validated
 
 logger = logging.getLogger(__name__)
 Tree = TypeVar("Tree")
