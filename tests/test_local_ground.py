@@ -164,7 +164,11 @@ def _lowest(person, body):
     )
     everywhere = person.present.shape
     feet = graph.GroundContact(
-        body, jnp.asarray(UP), jnp.zeros(everywhere), jnp.ones(everywhere)
+        body,
+        jnp.asarray(UP),
+        jnp.zeros(everywhere),
+        jnp.ones(everywhere),
+        jnp.zeros(everywhere),
     )
     residual = np.asarray(feet.residual(still))
     return float(residual[0, 0, 0])
@@ -200,7 +204,7 @@ def test_scale_from_people_on_any_floor(height):
     # A plane is used as it is; elsewhere the ground has a height under each foot.
     planar = np.ptp(np.asarray(contact.offset)) == 0
     assert planar == (height in (level, slope))
-    wide = initialisation.with_wander(contact, state, FPS)
+    wide = initialisation.with_elevation(contact, state, FPS)
     assert start_of(wide, state).ground_error < 1.2 * start.ground_error
 
 
@@ -214,7 +218,7 @@ def test_feet_that_rise_and_sink_over_the_floor_say_less_of_scale():
     """Motion capture whose floor drifts: scale errs by no more than is claimed."""
     rise = 0.16 * np.linspace(0, 1, 120)
     contact, state = ground_of(level, rise)
-    wide = initialisation.with_wander(contact, state, FPS)
+    wide = initialisation.with_elevation(contact, state, FPS)
     before, after = start_of(contact, state), start_of(wide, state)
     assert after.ground == before.ground != pytest.approx(UNIT, rel=0.02)
     assert after.ground_error > 1.5 * before.ground_error

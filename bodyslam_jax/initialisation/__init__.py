@@ -14,7 +14,7 @@ from bodyslam_jax.initialisation.ground import mean_up as mean_up
 from bodyslam_jax.initialisation.ground import (
     with_visible_feet as with_visible_feet,
 )
-from bodyslam_jax.initialisation.ground import with_wander as with_wander
+from bodyslam_jax.initialisation.ground import with_elevation as with_elevation
 from bodyslam_jax.initialisation.map_factors import (
     PIXEL_SIGMA_RANGE as PIXEL_SIGMA_RANGE,
 )

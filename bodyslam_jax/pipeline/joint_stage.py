@@ -253,7 +253,7 @@ def with_ground_of(
     )
     if old is None or contact is None:
         return prepared
-    contact = initialisation.with_wander(contact, state, fps)
+    contact = initialisation.with_elevation(contact, state, fps)
     changed = tuple(contact if factor is old else factor for factor in factors)
     return dataclasses.replace(
         prepared, problem=dataclasses.replace(prepared.problem, factors=changed)
