@@ -379,6 +379,9 @@ class JointEstimate:
     on_floor: Bool[np.ndarray, " h"] | None = None
     """People whom the estimate holds on one plane before a camera that does not move;
     `None` where there is no such plane."""
+    above_ground: Float[np.ndarray, "h t 3"] | None = None
+    """Upward vector, in the world, from the ground to what each person stands on, m;
+    `None` if everybody stands on the ground itself."""
     statures: Float[np.ndarray, "h 4"] | None = None
     """Stature that was given, its standard deviation, the stature had it not been
     given, and the standard deviation of that, m; NaN for people of whom none was given.
