@@ -277,11 +277,21 @@ class ScaleStart:
     """From a given camera path in metres."""
     path_error: float = float("inf")
     """Standard error of `path`."""
+    climbing: bool = False
+    """Whether those who determine `ground` stand at different heights over it."""
 
     @property
     def _weights(self) -> Float[np.ndarray, " 3"]:
         errors = [self.motion_error, self.ground_error, self.path_error]
         return np.array(errors) ** -2.0
+
+    @property
+    def by_climbers(self) -> float:
+        """Returns the relative error of `ground` where it is the best cue and of
+        people who stand at different heights; else NaN."""
+        errors = [self.motion_error / self.motion, self.path_error / self.path]
+        error = self.ground_error / self.ground
+        return error if self.climbing and error < min(errors) else float("nan")
 
     def without_motion(self) -> "ScaleStart":
         """Returns the start without the cue of people's motion."""
@@ -370,6 +380,9 @@ class JointEstimate:
     on_floor: Bool[np.ndarray, " h"] | None = None
     """People whom the estimate holds on one plane before a camera that does not move;
     `None` where there is no such plane."""
+    above_ground: Float[np.ndarray, "h t 3"] | None = None
+    """Upward vector, in the world, from the ground to what each person stands on, m;
+    `None` if everybody stands on the ground itself."""
     statures: Float[np.ndarray, "h 4"] | None = None
     """Stature that was given, its standard deviation, the stature had it not been
     given, and the standard deviation of that, m; NaN for people of whom none was given.

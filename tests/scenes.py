@@ -238,6 +238,7 @@ def extra_factors(rng, state, seen=None):
             normal=jnp.array([0.1, -0.99, 0.1]),
             offset=1.2 + 0.1 * normal(h, t),
             sigma=late(h, t, skip=1),
+            height=0.2 + 0.1 * normal(h, t),
         ),
     ]
 

@@ -190,7 +190,8 @@ def test_the_plane_is_where_feet_stand_and_believed_as_far_as_it_explains(rng):
     up = jnp.array([0.0, -1.0, 0.0])
     sigma = jnp.full((1, 20), 0.3).at[0, 0].set(jnp.inf)
     offset = jnp.full((1, 20), 2.0)
-    contact = g.GroundContact(scenes.body_model(), up, offset, sigma)
+    level = jnp.zeros((1, 20))
+    contact = g.GroundContact(scenes.body_model(), up, offset, sigma, level)
     stands = np.ones((1, 20, 4))
     stands[0, 5] = 0.0
     height = lambda factor, state: np.asarray(

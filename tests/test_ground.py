@@ -97,7 +97,8 @@ def contact(state: graph.State, units: float = 1.0) -> graph.GroundContact:
     everywhere = state.roots.shape[:2]
     up, sigma = jnp.array([0.0, -1.0, 0.0]), jnp.full(everywhere, 0.05)
     offset = jnp.full(everywhere, 1.3 / float(state.scale) / units)
-    return graph.GroundContact(scenes.body_model(), up, offset, sigma)
+    none = jnp.zeros(everywhere)
+    return graph.GroundContact(scenes.body_model(), up, offset, sigma, none)
 
 
 @pytest.mark.slow

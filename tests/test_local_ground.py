@@ -10,7 +10,12 @@ import scenes
 
 from bodyslam_jax import graph, initialisation, motion
 from bodyslam_jax.config import GraphWeights
-from bodyslam_jax.geometry.local_ground import ground_under, running_median, wander
+from bodyslam_jax.geometry.local_ground import (
+    elevation,
+    ground_under,
+    running_median,
+    wander,
+)
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.pipeline.joint_problem import Prepared
 from bodyslam_jax.pipeline.joint_stage import is_uneven, with_ground_of
@@ -110,6 +115,25 @@ def test_feet_wander_where_they_rise_over_seconds_and_not_by_noise_or_size():
     assert wander(heights, np.zeros((2, t), bool), FPS)[1] == 0.0
 
 
+def test_who_stands_at_different_heights_stands_above_the_floor():
+    rng = np.random.default_rng(5)
+    used = np.ones(480, bool)
+    noise = 0.01 * rng.standard_normal(480)
+    above, sigma = elevation(noise, used, FPS)
+    assert sigma == 0.0 and not above.any()
+    rungs = np.tile(np.repeat([0.28, 0.56, 0.84, 0.56], 30), 4)
+    above, sigma = elevation(rungs + noise, used, FPS)
+    np.testing.assert_allclose(above - above.min(), rungs - 0.28, atol=0.05)
+    assert 0 < above.min() < sigma < 0.28
+    # Where the floor is seen, too, and where less is seen.
+    steps = np.where(np.arange(480) < 240, 0.0, rungs)
+    above, sigma = elevation(steps + noise - 3.0, used, FPS)
+    assert np.abs(above - steps).mean() < sigma
+    _, long = elevation(rungs + noise, used, FPS)
+    _, short = elevation((rungs + noise)[:120], used[:120], FPS)
+    assert 3 * long < short
+
+
 UNIT = 5.0
 """m per unit of the map."""
 
@@ -164,7 +188,11 @@ def _lowest(person, body):
     )
     everywhere = person.present.shape
     feet = graph.GroundContact(
-        body, jnp.asarray(UP), jnp.zeros(everywhere), jnp.ones(everywhere)
+        body,
+        jnp.asarray(UP),
+        jnp.zeros(everywhere),
+        jnp.ones(everywhere),
+        jnp.zeros(everywhere),
     )
     residual = np.asarray(feet.residual(still))
     return float(residual[0, 0, 0])
@@ -188,8 +216,9 @@ def start_of(contact, state):
         rotation=jnp.zeros((0, 3)),
         valid=jnp.zeros(0, bool),
     )
-    prediction = jax.tree.map(lambda x: x[None], nothing)
-    return initialisation.scale_start(state, prediction, contact, without=(0,))
+    everyone = range(len(state.roots))
+    prediction = jax.tree.map(lambda x: jnp.stack([x for _ in everyone]), nothing)
+    return initialisation.scale_start(state, prediction, contact, without=everyone)
 
 
 @pytest.mark.parametrize("height", [level, slope, stairs, bumps])
@@ -200,8 +229,9 @@ def test_scale_from_people_on_any_floor(height):
     # A plane is used as it is; elsewhere the ground has a height under each foot.
     planar = np.ptp(np.asarray(contact.offset)) == 0
     assert planar == (height in (level, slope))
-    wide = initialisation.with_wander(contact, state, FPS)
-    assert start_of(wide, state).ground_error < 1.2 * start.ground_error
+    wide = start_of(initialisation.with_elevation(contact, state, FPS), state)
+    assert wide.ground == pytest.approx(UNIT, rel=0.02)
+    assert wide.ground_error < 1.2 * start.ground_error and not wide.climbing
 
 
 def test_a_table_before_the_feet_is_not_the_ground():
@@ -214,11 +244,59 @@ def test_feet_that_rise_and_sink_over_the_floor_say_less_of_scale():
     """Motion capture whose floor drifts: scale errs by no more than is claimed."""
     rise = 0.16 * np.linspace(0, 1, 120)
     contact, state = ground_of(level, rise)
-    wide = initialisation.with_wander(contact, state, FPS)
+    wide = initialisation.with_elevation(contact, state, FPS)
     before, after = start_of(contact, state), start_of(wide, state)
-    assert after.ground == before.ground != pytest.approx(UNIT, rel=0.02)
+    assert abs(after.ground - UNIT) < abs(before.ground - UNIT) > 0.02 * UNIT
     assert after.ground_error > 1.5 * before.ground_error
     assert abs(after.ground - UNIT) < 2 * after.ground_error
+
+
+def test_rungs_of_a_ladder_are_not_the_floor():
+    """Taken for the floor, they make the map a quarter too small."""
+    rungs = np.repeat([0.28, 0.56, 0.84, 0.56], [25, 35, 35, 25])
+    contact, state = ground_of(level, rungs)
+    wide = initialisation.with_elevation(contact, state, FPS)
+    before, after = start_of(contact, state), start_of(wide, state)
+    assert before.ground < 0.8 * UNIT
+    assert abs(after.ground - UNIT) < after.ground_error < 0.25 * UNIT
+    assert after.climbing and after.by_climbers > 0.1
+    walked = dataclasses.replace(after, motion=UNIT, motion_error=0.1 * UNIT)
+    assert np.isnan(walked.by_climbers)
+
+
+def test_who_stands_on_the_floor_tells_its_height_beside_a_climber():
+    rungs = np.repeat([0.28, 0.56, 0.84, 0.56], [25, 35, 35, 25])
+    (low, _, body), (high, _, _) = standing(level), standing(level, rungs)
+    people = ("roots", "poses", "shapes")
+    both = dataclasses.replace(
+        low,
+        **{
+            name: jnp.concatenate([getattr(s, name) for s in (low, high)])
+            for name in people
+        },
+    )
+    found = initialisation.ground_contact(
+        both, np.ones((2, 120), bool), None, body, GraphWeights(), FPS
+    )
+    assert found is not None
+    wide = initialisation.with_elevation(found, both, FPS)
+    start = start_of(wide, both)
+    assert start.ground == pytest.approx(UNIT, rel=0.02)
+    assert start.ground_error < 0.06 / 2.2 * UNIT and not start.climbing
+
+
+def test_feet_in_the_air_are_on_no_ground():
+    hop = np.zeros(120)
+    hop[50:60] = 0.3
+    contact, state = ground_of(level, hop)
+    wide = initialisation.with_elevation(contact, state, FPS)
+    away = np.isinf(np.asarray(wide.sigma)[0])
+    np.testing.assert_array_equal(away, hop > 0)
+    weighted = lambda f: np.average(
+        np.asarray(f.scales(state))[0], weights=np.asarray(f.sigma)[0] ** -2.0
+    )
+    assert weighted(wide) == pytest.approx(UNIT, rel=0.01)
+    assert weighted(contact) < 0.99 * UNIT
 
 
 def test_soles_are_where_the_person_stands():

@@ -64,7 +64,13 @@ def fitting() -> tuple[g.State, dict[str, g.Factor]]:
         g.RootOrientation(eye(3, 1, T), ones(1, T), zeros(1, T)),
         g.RootPositionPrior(ones(1, T, 3), ones(1, T, 2), zeros(1, T)),
         g.UprightPrior(jnp.array([0.0, -1, 0]), ones(1, T)),
-        g.GroundContact(body, jnp.array([0.0, -1, 0]), 1.5 * ones(1, T), ones(1, T)),
+        g.GroundContact(
+            body,
+            jnp.array([0.0, -1, 0]),
+            1.5 * ones(1, T),
+            ones(1, T),
+            zeros(1, T),
+        ),
     ]
     return state, {type(factor).__name__: factor for factor in factors}
 

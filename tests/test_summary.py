@@ -118,12 +118,20 @@ def test_an_undetermined_scale_is_doubtful_and_a_negative_one_failed():
     def verdict_on(**changes):
         one = dataclasses.replace(joint, **changes)
         found = assemble(sequence, config, body, cameras, one, {}).summary
-        about = [r["name"] for r in found["reasons"] if r["name"].startswith("scale_")]
+        about = [r["name"] for r in found["reasons"]]
+        about = [n for n in about if n.startswith(("scale_", "height_over_"))]
         return found["status"], about
 
     known = ScaleStart(motion=2.0, motion_error=0.1)
     assert verdict_on(start=known, scale_sigma=0.05)[1] == []
     assert verdict_on(start=ScaleStart(), scale_sigma=0.05)[1] == ["scale_unknown"]
+    climbed = ScaleStart(ground=2.0, ground_error=0.3, climbing=True)
+    sure = lambda start: verdict_on(start=start, scale_sigma=0.05)[1]
+    assert sure(climbed) == ["height_over_ground"]
+    level = dataclasses.replace(climbed, climbing=False)
+    walked = dataclasses.replace(climbed, motion=2.0, motion_error=0.1)
+    long = dataclasses.replace(climbed, ground_error=0.1)
+    assert not any(sure(start) for start in (level, walked, long))
     turned = verdict_on(start=known, scale=-3.0, scale_sigma=-0.1)
     assert turned == ("failed", ["scale_sign"])
 

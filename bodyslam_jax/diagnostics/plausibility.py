@@ -110,6 +110,7 @@ def implausible(
             of_world["scale_sigma"] = 100 * scale_sigma / abs(result.scale)
         of_world["scale_cues_apart"] = float(np.exp(cue_discrepancy(joint.start)))
         of_world["ground_under_feet"] = ground_factor
+        of_world["height_over_ground"] = 100 * joint.start.by_climbers
     anybody = moments.seen(np.any(result.present, axis=0))
     where = {name: of_camera.get(name, anybody) for name in of_world}
     return Doubts(tuple(of_people), judged(WORLD_CHECKS, of_world, None, where))

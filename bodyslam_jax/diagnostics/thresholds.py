@@ -382,4 +382,16 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "length are off, or they stand on something else",
         "estimates of nine simulated sequences: within 1.02; the limit is a judgement",
     ),
+    Check(
+        "height_over_ground",
+        "standard error of all lengths by the heights at which people stand over the "
+        "ground of the map",
+        "%",
+        10.0,
+        "people stand at different heights, as on a ladder, steps or a hill, and the "
+        "size of the map follows from the lowest of them: somebody who stands on "
+        "the ground or walks, or a camera path in metres, help",
+        "a judgement: half of the limit of `scale_sigma`, as it rests on one "
+        "assumption; without such heights 3 at eye level",
+    ),
 )

@@ -104,6 +104,10 @@ _WHOLE_SENTENCES = {
         "scene."
     ),
     "ground_under_feet": "People do not stand on the ground of the map.",
+    "height_over_ground": (
+        "People climb, and how high over the ground they are is hardly known; nor is "
+        "the size of the scene."
+    ),
     "not_finite": "The computation failed.",
     "camera_motion": "It was not found how the camera moved.",
     "people": "Nobody was found in the video, so sizes are unknown.",

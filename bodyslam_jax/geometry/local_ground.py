@@ -26,6 +26,9 @@ average out."""
 _WANDER_SIGMA_M = 0.03
 """Standard deviation of the running medians that estimation errors explain, m; that of
 simulated walkers on level ground is 0.01 to 0.015."""
+_LEVEL_DURATION_S = 3.0
+"""Time after which somebody who climbs stands at another, independent height, s. With
+it the errors of `elevation` are as large as it claims (`benchmarks/video.md`)."""
 
 
 def ground_under(
@@ -117,3 +120,34 @@ def wander(
     variance = ((high - low) / 2) ** 2
     excess = max(variance - _WANDER_SIGMA_M**2, 0.0)
     return slow * excess / max(variance, 1e-12), float(np.sqrt(excess))
+
+
+def elevation(
+    heights: Float[np.ndarray, " t"], used: Bool[np.ndarray, " t"], fps: float
+) -> tuple[Float[np.ndarray, " t"], float]:
+    """Returns how high over the floor one person stands, m, in each frame, and the
+    standard deviation of the mean of that, m.
+
+    Nobody stands below the floor. Somebody whose feet are at different heights stands
+    on something else than the floor most of the time, and perhaps all of the time: with
+    n independent heights, evenly distributed over a range r from the floor upwards, the
+    floor is below the lowest of them by a distance with an exponential distribution of
+    mean r / n. In half of the cases, by assumption, it is the lowest height itself.
+    Then the floor's distance has the mean r / (2 n) and the standard deviation
+    √3 r / (2 n).
+
+    Both results are 0 where errors of the estimate explain the heights (`wander`).
+
+    Args:
+        heights: of the feet over a plane parallel to the floor, m.
+    """
+    slow, spread = wander(heights[None], used[None], fps)
+    if not spread:
+        return np.zeros(len(heights)), 0.0
+    low, high = np.quantile(slow[0, used], [0.05, 0.95])
+    beyond = (high - low) * _LEVEL_DURATION_S * fps / used.sum()
+    above = np.where(used, slow[0] - low + beyond / 2, 0.0)
+    # `wander` reduces heights by the probability p that they are errors; these two
+    # cases differ by the mean height, with the variance p (1 - p) of that.
+    either = above[used].mean() * _WANDER_SIGMA_M / spread
+    return above, float(np.hypot(beyond * np.sqrt(0.75), either))

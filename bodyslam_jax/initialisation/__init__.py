@@ -11,10 +11,10 @@ from bodyslam_jax.initialisation.carried_people import (
 )
 from bodyslam_jax.initialisation.ground import ground_contact as ground_contact
 from bodyslam_jax.initialisation.ground import mean_up as mean_up
+from bodyslam_jax.initialisation.ground import with_elevation as with_elevation
 from bodyslam_jax.initialisation.ground import (
     with_visible_feet as with_visible_feet,
 )
-from bodyslam_jax.initialisation.ground import with_wander as with_wander
 from bodyslam_jax.initialisation.map_factors import (
     PIXEL_SIGMA_RANGE as PIXEL_SIGMA_RANGE,
 )

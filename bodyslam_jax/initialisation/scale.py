@@ -37,12 +37,30 @@ def scale_start(
     start = dataclasses.replace(start, motion_error=error)
     if contact is None:
         return start
-    used = np.isfinite(np.asarray(contact.sigma))
-    ground = float(np.median(scales(contact, state)[used]))
+    information = np.asarray(contact.sigma) ** -2.0
+    # By person, as those who stand at one height tell more than those who climb.
+    someone = information.any(axis=1)
+    mean = lambda values: float(
+        np.average(
+            [
+                np.median(x[told > 0])
+                for x, told in zip(values[someone], information[someone], strict=True)
+            ],
+            weights=information[someone].sum(axis=1),
+        )
+    )
+    ground = mean(scales(contact, state))
     # Error of the ground in m, over the camera's height above it in units.
-    metres = float(np.sum(np.asarray(contact.sigma) ** -2.0)) ** -0.5
-    error = metres / float(np.median(heights_of_camera(contact, state)[used]))
-    return dataclasses.replace(start, ground=ground, ground_error=error)
+    metres = float(information.sum()) ** -0.5
+    error = metres / mean(heights_of_camera(contact, state))
+    # Who climbs has little weight beside somebody who stands on the ground.
+    climbing = np.asarray(contact.height).any(axis=1) & someone
+    return dataclasses.replace(
+        start,
+        ground=ground,
+        ground_error=error,
+        climbing=bool(information[climbing].sum() > information[~climbing].sum()),
+    )
 
 
 def _motion_scale(

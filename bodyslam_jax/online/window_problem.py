@@ -301,6 +301,7 @@ def _ground(
         jnp.asarray([0.0, -1.0, 0.0]),
         jnp.zeros((window.places, FRAMES)),
         jnp.full((window.places, FRAMES), jnp.inf),
+        jnp.zeros((window.places, FRAMES)),
     )
     present = roots.present & window.located & legs & measured
     if window.fixed:
@@ -311,7 +312,7 @@ def _ground(
             state, present, sequence.keypoints, window.body, weights, window.fps
         )
     if contact is not None:
-        contact = initialisation.with_wander(contact, state, window.fps)
+        contact = initialisation.with_elevation(contact, state, window.fps)
     if np.isnan(window.scale_sigma):
         start = ScaleStart()
         if np.asarray(steps.valid)[:, CHUNK:].sum() >= _MIN_STEPS:

@@ -119,17 +119,24 @@ def stand_on_plane(
 
     At constant scale these heights determine the distance of people from the camera;
     otherwise held feet with underestimated steps would move them nearer. The ground is
-    shifted to the median height of standing feet, and weighted by how well it explains
-    them: where they rise and sink over seconds (`wander`), it follows them, and σ grows
-    with the remaining scatter; frames far from it, on a step or a kerb, have no weight.
+    shifted to the median height of standing feet, that of climbers to their own, and
+    weighted by how well it explains them: where they rise and sink over seconds
+    (`wander`), it follows them, and σ grows with the remaining scatter; frames far from
+    it, on a step or a kerb, have no weight.
     """
+    climbs = np.asarray(contact.height).any(axis=1)
+    contact = eqx.tree_at(lambda f: f.height, contact, jnp.zeros_like(contact.height))
     bare = eqx.tree_at(lambda f: f.sigma, contact, jnp.ones_like(contact.sigma))
     height = np.asarray(graph.residual_of(bare, state))[..., 0]
     stands = probability.max(axis=-1)
     used = np.isfinite(np.asarray(contact.sigma)) & (stands > 0.5)
     if used.sum() < _MIN_STANDING_FRAMES:
         return contact
-    offset = float(np.median(height[used])) + wander(height, used, fps)[0]
+    level = np.zeros((len(used), 1))
+    for group in (~climbs, *np.eye(len(used), dtype=bool)[climbs]):
+        feet = height[group][used[group]]
+        level[group] = np.median(feet) if len(feet) else 0.0
+    offset = level + wander(height, used, fps)[0]
     away = np.abs(height - offset)
     spread = max(1.4826 * float(np.median(away[used])) / _MAX_HEIGHT_SCATTER_M, 1.0)
     near = used & (away < 3 * spread * _MAX_HEIGHT_SCATTER_M)

@@ -162,7 +162,7 @@ def prepare(
             )
             factors = [found if factor is floor else factor for factor in factors]
         if contact is not None:
-            rough = initialisation.with_wander(contact, state, sequence.fps)
+            rough = initialisation.with_elevation(contact, state, sequence.fps)
             factors = [rough if factor is contact else factor for factor in factors]
             contact = rough
         start, passengers = _start_of_scale(

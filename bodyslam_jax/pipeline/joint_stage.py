@@ -141,7 +141,17 @@ def of_state(
         stages=stages,
         contacts=contacts,
         on_floor=None if prepared.moving else people_on_floor(prepared.problem),
+        above_ground=_above_ground(prepared.problem),
     )
+
+
+def _above_ground(problem: graph.Problem) -> Float[np.ndarray, "h t 3"] | None:
+    """Returns the upward vectors from the ground to what people stand on, m; `None` if
+    everybody stands on the ground itself."""
+    for factor in problem.factors:
+        if isinstance(factor, graph.GroundContact) and np.any(factor.height):
+            return np.asarray(factor.height)[..., None] * np.asarray(factor.normal)
+    return None
 
 
 def estimate_uncertainty(
@@ -253,7 +263,7 @@ def with_ground_of(
     )
     if old is None or contact is None:
         return prepared
-    contact = initialisation.with_wander(contact, state, fps)
+    contact = initialisation.with_elevation(contact, state, fps)
     changed = tuple(contact if factor is old else factor for factor in factors)
     return dataclasses.replace(
         prepared, problem=dataclasses.replace(prepared.problem, factors=changed)

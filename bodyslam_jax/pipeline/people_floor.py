@@ -65,6 +65,7 @@ def without_floor(
         jnp.array([0.0, -1.0, 0.0]),
         jnp.ones(present.shape),
         jnp.full(present.shape, jnp.inf),
+        jnp.zeros(present.shape),
     )
 
 

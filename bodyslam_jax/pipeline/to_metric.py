@@ -29,17 +29,21 @@ def to_metric(
 ) -> tuple[Result, Upright]:
     """Returns the result in a metric world whose y axis is up, and the estimate of up.
 
-    Standing feet are at y = 0. `edges` are straight edges in the world of `joint`.
+    Feet that stand on the ground are at y = 0. `edges` are straight edges in the world
+    of `joint`.
     """
     T_WC = joint.cameras.copy()
     T_WC[:, :3, 3] *= joint.scale
     joints = _placed(sequence, config, body, joint, T_WC)[2]
+    above = joint.above_ground
+    # Rungs and steps under feet are no plane: feet are where the ground is below them.
+    above = np.zeros((*joint.present.shape, 3)) if above is None else above
     landmarks = joint.scale * joint.landmarks
     standing = toes_standing(joint.contacts)
     turn, up = level(
         T_WC,
         T_WC @ joint.roots,
-        joints[:, :, list(FEET)],
+        joints[:, :, list(FEET)] - above[:, :, None],
         joint.present,
         landmarks if cameras.kind == "moving" else landmarks[:0],
         sequence.fps,
@@ -53,9 +57,12 @@ def to_metric(
     landmarks = landmarks @ turn[:3, :3].T + turn[:3, 3]
     poses, trans, joints = _placed(sequence, config, body, joint, T_WC)
     if joint.present.any():
-        floor = floor_height(
-            body, joint.shapes, joints, joint.present, sequence.fps, standing
-        )
+        lowered = joints - (above @ turn[:3, :3].T)[:, :, None]
+        # By climbers only if nobody stands on the ground.
+        climbs = np.any(above != 0, axis=(1, 2))
+        on_ground = joint.present & ~climbs[:, None]
+        told = on_ground if on_ground.any() else joint.present
+        floor = floor_height(body, joint.shapes, lowered, told, sequence.fps, standing)
         for points in (T_WC[:, :3, 3], trans, joints, landmarks):
             points[..., 1] -= floor
     result = Result(

@@ -1,12 +1,12 @@
 """People stand on the ground of the map.
 
-    r = (n^T (s r'_WC + C_WC p_C) + s d - SOLE_HEIGHT_M) / σ
+    r = (n^T (s r'_WC + C_WC p_C) + s d - SOLE_HEIGHT_M - z) / σ
 
 In m. `n^T x' + d = 0` is the ground among the landmarks, in units of the map: one
 plane, or, where the ground is not a plane, level ground of a different height d under
-each person in each frame. `p_C` is the soft minimum, along n, of heels and toes. It
-relates metres of the body to units of the map, so scale is observable even where nobody
-walks.
+each person in each frame; z is the height of what they stand on above it, such as a
+ladder's rung. `p_C` is the soft minimum, along n, of heels and toes. It relates metres
+of the body to units of the map, so scale is observable even where nobody walks.
 Default: `weights.ground_sigma` = 0.04 m, one error for the whole sequence: times the
 root of the number of frames. Ours.
 """
@@ -41,14 +41,17 @@ class GroundContact(FrameFactor):
     sigma: Float[Array, "h t"]
     """m; `inf` where feet or the ground are not visible. The ground has one error in
     all frames, so this is its standard deviation times the root of their number."""
+    height: Float[Array, "h t"]
+    """z, m: 0 for who stands on the ground itself."""
     loss: Loss = Squared()
     padding = {"sigma": jnp.inf}
     map_units = {"offset": 1}
     keys = (("camera", 0), ("root", 0), ("pose", 0), ("scale", 0), ("shape", 0))
 
     def frame_residual(self, data, window, shared):
-        (offset, sigma), (frame,) = data, window
-        return (self._lowest(frame, shared, offset) - SOLE_HEIGHT_M)[None] / sigma
+        (offset, sigma, above), (frame,) = data, window
+        lowest = self._lowest(frame, shared, offset)
+        return (lowest - SOLE_HEIGHT_M - above)[None] / sigma
 
     def residual(self, state: State) -> Float[Array, "h t 1"]:
         # As `KeypointReprojection` does, so that both compute the body once.
@@ -61,10 +64,10 @@ class GroundContact(FrameFactor):
         level = state.scale * (state.cameras[:, :3, 3] @ self.normal + self.offset)
         height = height + (jnp.sum(r_CH * up_C, axis=-1) + level)[..., None]
         lowest = _soft_minimum(height)
-        return ((lowest - SOLE_HEIGHT_M) / self.sigma)[..., None]
+        return ((lowest - SOLE_HEIGHT_M - self.height) / self.sigma)[..., None]
 
     def jacobian(self, data, window, shared):
-        (offset, sigma), (frame,) = data, window
+        (offset, sigma, above), (frame,) = data, window
         p_H, by_pose, by_shape = keypoint_jacobian(
             self.body, frame.pose, shared.shape, "body25", 0.0, HEELS_AND_TOES
         )
@@ -85,25 +88,26 @@ class GroundContact(FrameFactor):
             ("shape", 0): jnp.einsum("f,i,fib->b", share, up_H, by_shape),
         }
         parts = {key: part[None] / sigma for key, part in parts.items()}
-        return (_soft_minimum(height) - SOLE_HEIGHT_M)[None] / sigma, parts
+        lowest = _soft_minimum(height)
+        return (lowest - SOLE_HEIGHT_M - above)[None] / sigma, parts
 
     def scales(self, state: State) -> Float[Array, "h t"]:
-        """Returns the s that puts the feet on the ground, for each person and frame."""
+        """Returns the s that puts the feet at their height over the ground, for each
+        person and frame."""
         return self.map_frames(self._scale, state)
 
     def _scale(self, data, window, shared, _):
-        (offset, _), (frame,) = data, window
+        (offset, _, above), (frame,) = data, window
         eye = self.normal @ frame.camera[:3, 3] + offset
-        return (
-            shared.scale * eye - self._lowest(frame, shared, offset) + SOLE_HEIGHT_M
-        ) / eye
+        over = self._lowest(frame, shared, offset) - SOLE_HEIGHT_M - above
+        return (shared.scale * eye - over) / eye
 
     def soles(self, state: State) -> Float[Array, "h t 3"]:
         """Returns the lowest point of the soles in the camera frame, m."""
         return self.map_frames(self._sole, state)
 
     def _sole(self, data, window, shared, _):
-        (offset, _), (frame,) = data, window
+        (offset, *_), (frame,) = data, window
         p_H = local_keypoints(self.body, frame.pose, shared.shape, "body25")
         p_H = p_H[np.array(HEELS_AND_TOES)]
         height, up_C = self._heights(p_H, frame, shared, offset)
