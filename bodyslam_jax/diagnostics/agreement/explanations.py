@@ -39,6 +39,8 @@ large (0.05 to 0.13 of a person's size)."""
 _SIZE_RATIO_TOLERANCE = 0.12
 """Relative difference up to which a usual focal length explains a ratio of sizes: a
 regressor's error of size."""
+_CROP_FOCAL_PX = 5000.0
+"""Focal length of SPIN (Kolotouros et al., ICCV 2019) and its successors, px."""
 _NEAR_FACTORS = (0.85, 0.92, 1.0, 1.08, 1.17)
 """Factors on a measured ratio with which a focal length is tried, steps of 8 %: the
 size of people nearby is not quite proportional to it."""
@@ -118,10 +120,9 @@ def _other_bodies(people: People, ratios: list[float]) -> Iterator[Explanation]:
     """Yields explanations by another focal length and by another unit of `trans`."""
     camera = people.camera
     longer = max(camera.width, camera.height)
-    # Default focal lengths of tools of `io.bodies.formats`, and SPIN's.
-    usual = np.array(
-        [np.hypot(camera.width, camera.height), 5000 / 256 * longer, 5000.0]
-    )
+    # The image's diagonal (CLIFF, WHAM), HMR2's for a crop of 256 px, and SPIN's.
+    diagonal = np.hypot(camera.width, camera.height)
+    usual = np.array([diagonal, _CROP_FOCAL_PX / 256 * longer, _CROP_FOCAL_PX])
     for ratio in ratios:
         factors = [(float(f), True) for f in usual / camera.params[0]]
         factors = [

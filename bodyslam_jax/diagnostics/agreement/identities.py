@@ -35,6 +35,7 @@ person."""
 _MAX_OVERLAP_SHARE = 0.15
 """Share of the frames that two rows of one person may have in common."""
 _MIN_COINCIDENT_SHARE = 0.8
+"""Share of the frames that two rows share in which they must be that near."""
 _MIN_SHARED_FRAMES = 3
 _MAX_GAP_FRAMES = 5
 """Gap, in frames, up to which a person without keypoints is recognised by position."""
