@@ -17,6 +17,7 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.geometry.lengths import padded_length
+from bodyslam_jax.geometry.whittaker import curvature_bands
 from bodyslam_jax.people.costs import MIN_DEPTH_M, robust
 from bodyslam_jax.people.hypotheses import find_turned
 from bodyslam_jax.people.keypoint_errors import (
@@ -229,11 +230,7 @@ def _smooth_curve(
     index = where - where[0]
     noise = max(_spread(np.diff(values, 2)) / np.sqrt(6), 0.1 * jitter)
     sigma = noise * np.sqrt(10.0)
-    difference = np.array([1.0, -2.0, 1.0]) / jitter
-    stiffness = np.zeros((3, total))
-    for a in range(3):
-        for b in range(a, 3):
-            stiffness[2 - (b - a), b : total - 2 + b] += difference[a] * difference[b]
+    stiffness = curvature_bands(int(total)) / jitter**2
     filled = np.interp(np.arange(total), index, values)
     weight = np.zeros(total)
     weight[index] = sigma**-2
