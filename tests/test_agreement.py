@@ -1,4 +1,4 @@
-"""Keypoints, bodies and camera that contradict each other: undone, refused or said."""
+"""Keypoints, bodies and camera that contradict each other: mended, refused or said."""
 
 import dataclasses
 import json
@@ -189,50 +189,6 @@ def test_half_a_person_in_the_image_is_no_contradiction():
     assert reconcile(given, BODY) is given
 
 
-@pytest.mark.parametrize(
-    ("to", "swap", "text"),
-    [
-        (lambda u, v: (u / 2, v / 2), False, "copy of 320x240 px"),
-        (lambda u, v: (u * 1.5, v * 1.5), False, "copy of 960x720 px"),
-        (lambda u, v: (H - 1 - v, u), False, "90 degrees clockwise"),
-        (lambda u, v: (v, W - 1 - u), False, "90 degrees anticlockwise"),
-        (lambda u, v: (W - 1 - u, H - 1 - v), False, "180 degrees"),
-        (lambda u, v: ((H - 1 - v) / 2, u / 2), False, "320x240 px, turned"),
-        (lambda u, v: (u, H - 1 - v), False, "counted from the lower edge"),
-        (lambda u, v: (v, u), False, "x and y exchanged"),
-    ],
-)
-def test_keypoints_of_a_resized_or_turned_copy_are_put_back(to, swap, text):
-    true = sequence()
-    found = reconcile(mapped(true, to, swap), BODY)
-    same_people(found, true)
-    assert text in said(found)
-
-
-@pytest.mark.parametrize(
-    ("R", "text"),
-    [
-        (np.diag([1.0, -1.0, -1.0]), "down is -y, forward is -z"),
-        (np.diag([-1.0, -1.0, 1.0]), "right is -x, down is -y"),
-        (np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), "forward is y"),
-        (np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), "down is -x"),
-    ],
-)
-def test_bodies_in_other_axes_are_turned_back(R, text):
-    true = sequence()
-    found = reconcile(moved(true, R=R), BODY)
-    same_people(found, true)
-    assert text in said(found)
-
-
-@pytest.mark.parametrize("unit", [1000.0, 100.0, 10.0])
-def test_bodies_in_another_unit_are_put_in_metres(unit):
-    true = sequence()
-    found = reconcile(moved(true, lambda p: p * unit), BODY)
-    same_people(found, true)
-    assert f"divided by {unit:g}" in said(found)
-
-
 @pytest.mark.parametrize("focal", [np.hypot(W, H), 5000 / 256 * W])
 def test_bodies_of_a_usual_focal_length_are_refocused(focal):
     true = sequence()
@@ -262,28 +218,40 @@ def test_a_principal_point_in_the_middle_is_taken_for_what_it_is():
     assert "principal point" in said(found)
 
 
+def turned(s: Sequence) -> Sequence:
+    """Bodies of a world with another place and orientation than the camera's."""
+    R = Rotation.from_euler("xyz", [0.3, 0.9, 0.2]).as_matrix()
+    return moved(s, lambda p: p + [2.0, -1.0, 3.0], R)
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
+        (lambda s: mapped(s, lambda u, v: (u / 2, v / 2)), r"0\.(49|50)\d times the"),
         (
-            lambda s: mapped(s, lambda u, v: (u * 0.61, v * 0.61)),
-            r"0\.6[012]\d times this video of 640x480",
+            lambda s: mapped(s, lambda u, v: (u * 1.5, v * 1.5)),
+            r"1\.(4[89]|5[01])\d times",
         ),
-        (lambda s: mapped(s, lambda u, v: (u - 90, v - 40)), r"moved by \(-9\d, -[34]"),
-        (lambda s: mapped(s, lambda u, v: (u * 0.65, v * 0.65 + 52)), "padded copy"),
+        (lambda s: mapped(s, lambda u, v: (u * 0.61, v * 0.61)), r"0\.6[012]\d times"),
+        (lambda s: mapped(s, lambda u, v: (H - 1 - v, u)), "degrees clockwise"),
+        (lambda s: mapped(s, lambda u, v: (v, W - 1 - u)), "degrees anticlockwise"),
+        (lambda s: mapped(s, lambda u, v: (W - 1 - u, H - 1 - v)), "180 degrees"),
+        (lambda s: mapped(s, lambda u, v: ((H - 1 - v) / 2, u / 2)), "degrees clockw"),
+        (lambda s: mapped(s, lambda u, v: (u, H - 1 - v)), "from the lower edge"),
+        (lambda s: mapped(s, lambda u, v: (v, u)), "x and y exchanged"),
         (lambda s: mapped(s, lambda u, v: (W - 1 - u, v), True), "mirrored"),
         (lambda s: mapped(s, lambda u, v: (W - 1 - u, v)), "mirrored"),
+        (lambda s: mapped(s, lambda u, v: (u - 90, v - 40)), r"moved by \(-9\d, -[34]"),
+        (lambda s: mapped(s, lambda u, v: (u * 0.65, v * 0.65 + 52)), "of this video"),
+        (lambda s: moved(s, lambda p: p * 1000), "times as large"),
+        (lambda s: moved(s, lambda p: p * 10), r"(9|1[01])\.\d\d times as large"),
         (lambda s: moved(s, lambda p: p * 1.9), r"(1\.[6-9]|2\.[01])\d times as large"),
-        (
-            lambda s: moved(
-                s,
-                lambda p: p + [2.0, -1.0, 3.0],
-                Rotation.from_euler("xyz", [0.3, 0.9, 0.2]).as_matrix(),
-            ),
-            "in the frame of",
-        ),
-        (lambda s: retimed(s, "keypoints", np.round(1.2 * K).astype(int)), r"1\.2 k"),
-        (lambda s: retimed(s, "bodies", (K + 9) % FRAMES), "numbered .* earlier"),
+        (lambda s: moved(s, R=np.diag([1.0, -1.0, -1.0])), "in the frame of"),
+        (lambda s: moved(s, R=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])), "frame"),
+        (turned, "in the frame of"),
+        (lambda s: retimed(s, "keypoints", 2 * K), "keypoints .* one frame in 2"),
+        (lambda s: retimed(s, "bodies", 3 * K), "bodies .* one frame in 3"),
+        (lambda s: retimed(s, "bodies", (K + 25) % FRAMES), "frames of this video"),
     ],
 )
 def test_contradictions_are_refused_in_one_line(change, text):
@@ -291,24 +259,6 @@ def test_contradictions_are_refused_in_one_line(change, text):
         reconcile(change(sequence()), BODY)
     assert str(refusal.value).startswith("clip: ")
     assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize(
-    ("what", "frames", "text"),
-    [
-        ("keypoints", 2 * K, "every 2nd frame"),
-        ("keypoints", 3 * K, "every 3rd frame"),
-        ("bodies", 2 * K, "every 2nd frame"),
-        ("bodies", K - 6, "bodies moved by -6 frames"),
-        ("bodies", K + 9, "bodies moved by +9 frames"),
-        ("keypoints", K - 8, "keypoints moved by -8 frames"),
-    ],
-)
-def test_frames_numbered_anew_are_put_back(what, frames, text):
-    true = sequence()
-    found = reconcile(retimed(true, what, frames), BODY)
-    same_people(found, true)
-    assert text in said(found)
 
 
 def test_sides_that_contradict_are_said():
@@ -389,7 +339,7 @@ def test_people_keep_to_themselves():
 
 
 @pytest.mark.parametrize("what", ["bodies", "keypoints"])
-def test_exchanged_numbers_are_put_back(what):
+def test_exchanged_numbers_are_doubted(what):
     true = sequence(walker(), walker(start=(0.5, 0.1, 5.5), velocity=(0.2, 0, 0)))
     bundle, exchanged = getattr(true, what), {}
     for name, value in vars(bundle).items():
@@ -400,8 +350,9 @@ def test_exchanged_numbers_are_put_back(what):
         true, **{what: dataclasses.replace(bundle, **exchanged)}
     )
     found = reconcile(given, BODY)
-    same_people(found, true)
-    assert f"{what} of persons 0 and 1 are exchanged in 25 frames" in said(found)
+    assert not found.warnings
+    for h, text in enumerate(found.contradictions):
+        assert text.startswith(f"person {h}: in 42 % of the frames, between 35 and 59")
 
 
 def test_who_is_not_there_is_left_out():
@@ -428,21 +379,6 @@ def test_keypoints_alone_tell_by_peoples_shape(to, text):
     assert text in said(found)
 
 
-def test_keypoints_beyond_a_portrait_video_are_turned_back():
-    """As a phone stores it: 640x480, shown as 480x640; detected on what is stored."""
-    low = walker(start=(-0.2, 1.0, 3.5), velocity=(0.05, 0.0, 0.0))
-    landscape = sequence(low)
-    portrait = dataclasses.replace(
-        CAMERA, params=CAMERA.params[[0, 1, 3, 2]], width=H, height=W
-    )
-    shown = mapped(landscape, lambda u, v: (u - (W - H) / 2, v + (W - H) / 2))
-    shown = dataclasses.replace(shown, intrinsics=portrait, bodies=None)
-    stored = mapped(shown, lambda u, v: (v, H - 1 - u))
-    found = reconcile(stored, BODY)
-    np.testing.assert_allclose(found.keypoints.uv, shown.keypoints.uv, atol=1e-9)
-    assert "turned back" in said(found)
-
-
 def test_who_lies_or_stands_on_the_hands_for_a_while_is_not_spoken_of():
     s = dataclasses.replace(sequence(), bodies=None)
     uv = s.keypoints.uv.copy()
@@ -458,12 +394,6 @@ def test_bodies_alone_have_to_be_in_the_image():
         reconcile(moved(true, lambda p: p + [9.0, 0.0, 0.0]), BODY)
     found = reconcile(moved(true, R=np.diag([-1.0, -1.0, 1.0])), BODY)
     assert "y points up" in said(found)
-
-
-def test_keypoints_that_end_early_are_said_without_bodies():
-    given = dataclasses.replace(retimed(sequence(), "keypoints", 2 * K), bodies=None)
-    found = reconcile(given, BODY)
-    assert "frames 0 to 29 of 60, one frame in 2" in said(found)
 
 
 def test_nothing_to_compare_is_nothing_to_say():

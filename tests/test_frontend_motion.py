@@ -401,18 +401,6 @@ def test_too_little_to_go_on(num, points):
     assert not found.registered.any() and len(found.landmarks) == 0
 
 
-def test_a_refinement_of_the_callers_own_is_used():
-    calls = []
-
-    def refine(scene: Scene, views: Views, free: np.ndarray) -> None:
-        calls.append(int(free.sum()))
-        adjust(scene, views, free, loss=1 / 260)
-
-    tracks, truth = scene("sideways", num=20)
-    found = reconstruct(tracks, CAMERA, 20, Structure(), refine)
-    assert len(calls) > 3 and camera_error(found.T_WC, truth) < 0.05
-
-
 def test_adjustment_finds_the_truth_from_exact_views():
     rng = np.random.default_rng(0)
     R, centre = path("orbit", 6, rng)

@@ -395,16 +395,3 @@ def test_a_regressors_shape_is_taken_to_be_drawn_to_the_mean(
     np.testing.assert_allclose(found.shapes, gain * truth.shapes, atol=1e-12)
     assert not found.shapes_regressed  # or it would be multiplied again
     assert Config.paper().people_fit.regressor_shape_gain == 1
-
-
-def test_noise_of_regressed_bodies():
-    rng = np.random.default_rng(6)
-    size = (2, 1000)
-    trans = np.array([0, 0, 4.0]) + 0.05 * rng.normal(size=(*size, 3))
-    poses = 0.1 + 0.03 * rng.normal(size=(*size, 72))
-    shapes = 0.2 * rng.normal(size=(*size, 10))
-    noise = people.body_noise(Bodies(np.ones(size, bool), poses, shapes, trans))
-    np.testing.assert_allclose(noise.posture, 0.03, rtol=0.1)
-    np.testing.assert_allclose(noise.orientation, 0.03, rtol=0.1)
-    np.testing.assert_allclose(noise.depth, 0.05, rtol=0.15)  # 1000 frames, correlated
-    np.testing.assert_allclose(noise.shape, 0.2, rtol=0.15)

@@ -262,17 +262,17 @@ def test_keypoints_that_are_another_persons_are_doubted():
     error[rng.random(error.shape) < 0.1] = 150.0
     error[rng.random(error.shape) < 0.2] = np.nan
     doubted = lambda error: judge(
-        PERSON_CHECKS, {"keypoint_misfit": figures.keypoint_misfit(error, size, FPS)}
+        PERSON_CHECKS, {"keypoint_misfit": figures.worst_misfit(error, size, FPS)[0]}
     )
     assert doubted(error) == []
     assert doubted(4 * error) == []  # noise, however large
     error[20:24] = 30.0  # too short
     assert doubted(error) == []
     error[30:45] = 30.0
-    assert figures.keypoint_misfit(error, size, FPS) == pytest.approx(15.0)
+    assert figures.worst_misfit(error, size, FPS)[0] == pytest.approx(15.0)
     assert len(doubted(error)) == 1
     error[:] = np.nan
-    assert np.isnan(figures.keypoint_misfit(error, size, FPS))
+    assert np.isnan(figures.worst_misfit(error, size, FPS)[0])
 
 
 def test_a_reason_says_where_to_look(truth):

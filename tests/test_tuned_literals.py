@@ -26,6 +26,11 @@ _LIMIT = 0.35
 \"\"\"From the data.\"\"\"
 _OTHER = 0.7
 
+LIMITS = (
+    Limit(0.3, source="people differ by 0.2"),
+    Limit(0.4),
+)
+
 def shrink(x, share=0.9):
     # Twice the noise of tracks.
     return x * 1.4 if x > 17 else share
@@ -33,6 +38,8 @@ def shrink(x, share=0.9):
     assert found(text) == [
         ("_LIMIT", 0.35, True),
         ("_OTHER", 0.7, False),
+        ("LIMITS", 0.3, True),
+        ("LIMITS", 0.4, False),
         ("shrink", 0.9, False),
         ("shrink", 1.4, True),
         ("shrink", 17, True),

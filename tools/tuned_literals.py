@@ -7,7 +7,8 @@ their negatives, a half, indices and slices, axes, shapes and sizes of arrays, r
 numbers inside text, exponents of powers, integers in a table (a tuple or list of more
 than three), and the dimensions of vectors, rotations and body models. Units are powers
 of ten, and what converts degrees, minutes, bytes and colours. A number has a source if
-a docstring follows its name or a comment is on its line or the one before. `--list`
+a docstring follows its name, a comment is on its line or the one before, or it is an
+argument of a call that names its `source`. `--list`
 prints every literal, `--without-source` only those without one.
 """
 
@@ -56,9 +57,11 @@ def literals(text: str) -> list[Literal]:
 
 
 def _documented(tree: ast.AST) -> set[int]:
-    """Lines of assignments that a docstring follows."""
+    """Lines of assignments that a docstring follows, and of calls with a `source`."""
     found = set()
     for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and "source" in [k.arg for k in node.keywords]:
+            found |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
         body = getattr(node, "body", None)
         if not isinstance(body, list):
             continue

@@ -41,6 +41,7 @@ STILL_CAMERA_SIGMA_PX = 0.6
 errors, px at an image width of 640 px: the limit below which structure from motion
 classifies a camera as static."""
 _REFERENCE_WIDTH_PX = 640.0
+"""Image width of the figure above; errors of tracking grow with the image."""
 
 
 @dataclasses.dataclass(frozen=True)

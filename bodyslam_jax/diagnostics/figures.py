@@ -19,7 +19,11 @@ _MIN_STEP_LEGS = 0.35
 _MIN_STRETCH_FRAMES = 15
 """Length from which a stretch is judged, frames."""
 
+_SPEED_PERCENTILE = 95
+"""Percentile of the speeds that `thresholds` names and judges."""
 _MIN_MISFIT_RATIO = 2.2
+"""Ratio of the worst misfit to the median over the video below which it is noise: on
+simulated sequences it is nowhere twice the median (`thresholds`)."""
 
 _FRONT_BACK_ANGLE_DEG = 90.0
 """Angle from which a difference in orientation is a front/back ambiguity, not an
@@ -65,7 +69,7 @@ def person_figures(
     speed = joined(posture.pelvis_speed, fps)
     knee = posture.knee_flexion(every)
     found = {
-        "speed": float(np.percentile(speed, 95)),
+        "speed": float(np.percentile(speed, _SPEED_PERCENTILE)),
         "joint_acceleration": float(np.median(joined(posture.joint_acceleration, fps))),
         "turn": float(joined(posture.turning_rate, fps, MOMENT_S).max()),
         "velocity_jump": float(joined(posture.speed_change, fps, MOMENT_S).max()),
@@ -113,7 +117,7 @@ def camera_figures(T_WC: Float[np.ndarray, "t 4 4"], fps: float) -> dict[str, fl
     trace = np.einsum("tij,tij->t", turn[:-n], turn[n:])
     angle = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
     return {
-        "camera_speed": float(np.percentile(moved, 95)),
+        "camera_speed": float(np.percentile(moved, _SPEED_PERCENTILE)),
         "camera_acceleration": float(
             np.linalg.norm(bent, axis=1).max() * (fps / n) ** 2
         ),
@@ -152,13 +156,6 @@ def floors_apart(
     stances = find_stances(joints[:, :, list(FEET)], present, fps)
     heights = [np.median(places[:, 1]) for places in stances if len(places)]
     return float(np.ptp(heights)) if len(heights) > 1 else np.nan
-
-
-def keypoint_misfit(
-    error: Float[np.ndarray, "t k"], size: Float[np.ndarray, " t"], fps: float
-) -> float:
-    """Returns the first value of `worst_misfit`, without its frames."""
-    return worst_misfit(error, size, fps)[0]
 
 
 def worst_misfit(

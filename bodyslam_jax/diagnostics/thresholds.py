@@ -40,7 +40,8 @@ PERSON_CHECKS: tuple[Check, ...] = (
         0.4,
         "positions from frame to frame are not to be trusted: better keypoints, a "
         "known focal length, or a regressor's bodies (--bodies) help",
-        "given; motion capture of people who do not run: median 0.09, 99 % below 0.36",
+        source="given; motion capture of people who do not run: median 0.09, 99 % "
+        "below 0.36",
     ),
     Check(
         "gliding",
@@ -48,7 +49,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "% of the person's",
         50.0,
         _CARRIED_ADVICE,
-        _MOCAP + " of people who advance: at most 19",
+        source=_MOCAP + " of people who advance: at most 19",
     ),
     Check(
         "step_short_of_reach",
@@ -57,7 +58,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         0.6,
         "the person steps and hardly advances: on a treadmill or on the spot that is "
         "right, and steps tell no size. Otherwise scale or frame rate are off",
-        _MOCAP + " of people who stride: at least 0.7",
+        source=_MOCAP + " of people who stride: at least 0.7",
         below=True,
     ),
     Check(
@@ -66,7 +67,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "",
         1.4,
         _CARRIED_ADVICE,
-        _MOCAP + " of people who walk: at most 1.23",
+        source=_MOCAP + " of people who walk: at most 1.23",
     ),
     Check(
         "step_beyond_reach_of_runner",
@@ -74,7 +75,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "",
         2.2,
         _CARRIED_ADVICE,
-        _MOCAP + " of people who run: 1.6 to 1.86",
+        source=_MOCAP + " of people who run: 1.6 to 1.86",
     ),
     Check(
         "quick_steps",
@@ -84,7 +85,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "children step so quickly: a child's body is given or fitted as an adult's, "
         "and every length is too large by as much; give the stature (--height). For "
         "an adult the frame rate is off",
-        _MOCAP + " of people who walk: at most 2.22",
+        source=_MOCAP + " of people who walk: at most 2.22",
     ),
     Check(
         "turned_from_body",
@@ -93,8 +94,8 @@ PERSON_CHECKS: tuple[Check, ...] = (
         15.0,
         "on stairs, escalators and steep slopes people are tilted until they move as "
         "on level ground, and up with them; otherwise the bodies are of another camera",
-        "ten simulated sequences: regressed bodies are off by 2 to 8, with twice the "
-        "usual errors by 5 to 17",
+        source="ten simulated sequences: regressed bodies are off by 2 to 8, with "
+        "twice the usual errors by 5 to 17",
     ),
     Check(
         "feet_off_ground",
@@ -102,7 +103,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "m",
         0.12,
         "the person floats or sinks: " + _GROUND_ADVICE,
-        _MOCAP + " of people who walk: 99 % below 0.07, on uneven terrain 0.15",
+        source=_MOCAP + " of people who walk: 99 % below 0.07, on uneven terrain 0.15",
     ),
     Check(
         "ground_slope",
@@ -110,7 +111,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "degrees",
         6.0,
         "the person rises or sinks along the path: " + _GROUND_ADVICE,
-        _MOCAP + " of people who walk: at most 5; streets rarely exceed 6",
+        source=_MOCAP + " of people who walk: at most 5; streets rarely exceed 6",
     ),
     Check(
         "knee",
@@ -118,7 +119,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "degrees",
         52.0,
         "legs are too long for the keypoints, or the fit is wrong: " + _FIT_ADVICE,
-        _MOCAP + " of people who walk: 98 % below 48, soccer 51",
+        source=_MOCAP + " of people who walk: 98 % below 48, soccer 51",
     ),
     Check(
         "straighter_knee",
@@ -126,7 +127,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "degrees",
         44.0,
         "legs are too long for the keypoints, or the fit is wrong: " + _FIT_ADVICE,
-        _MOCAP + " of people who walk: 98 % below 40, soccer 43",
+        source=_MOCAP + " of people who walk: 98 % below 40, soccer 43",
     ),
     Check(
         "hip_over_ankle",
@@ -134,7 +135,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "",
         0.84,
         "people crouch who do not: " + _FIT_ADVICE,
-        _MOCAP + " of people who walk: at least 0.85",
+        source=_MOCAP + " of people who walk: at least 0.85",
         below=True,
     ),
     Check(
@@ -143,7 +144,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "degrees",
         18.0,
         "nobody walks so: " + _FIT_ADVICE,
-        _MOCAP + " of people who walk: below 15, but for basketball (19 and 32)",
+        source=_MOCAP + " of people who walk: below 15, but for basketball (19 and 32)",
     ),
     Check(
         "turn_of_walker",
@@ -151,7 +152,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "degrees/s within 0.2 s",
         500.0,
         _IDENTITY_ADVICE,
-        _MOCAP + " of people who walk: at most 170; dancing on the way 500",
+        source=_MOCAP + " of people who walk: at most 170; dancing on the way 500",
     ),
     Check(
         "turn",
@@ -159,7 +160,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "degrees/s within 0.2 s",
         600.0,
         _IDENTITY_ADVICE,
-        _MOCAP + ": at most 500, in a pirouette",
+        source=_MOCAP + ": at most 500, in a pirouette",
     ),
     Check(
         "velocity_jump_of_walker",
@@ -167,7 +168,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "m/s within 0.2 s",
         1.8,
         _IDENTITY_ADVICE,
-        _MOCAP + " of people who walk: at most 1.4",
+        source=_MOCAP + " of people who walk: at most 1.4",
     ),
     Check(
         "velocity_jump",
@@ -175,7 +176,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "m/s within 0.2 s",
         2.8,
         _IDENTITY_ADVICE,
-        _MOCAP + ": at most 1.9, in a jump",
+        source=_MOCAP + ": at most 1.9, in a jump",
     ),
     Check(
         "joint_acceleration",
@@ -183,7 +184,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "m/s²",
         22.0,
         "the person trembles: " + _FIT_ADVICE,
-        _MOCAP + ": at most 18, in a run",
+        source=_MOCAP + ": at most 18, in a run",
     ),
     Check(
         "speed",
@@ -191,7 +192,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "m/s",
         10.0,
         "nobody runs as fast: the frame rate, the focal length or scale is off",
-        "sprinters reach 10 to 12 m/s",
+        source="sprinters reach 10 to 12 m/s",
     ),
     Check(
         "stature",
@@ -199,7 +200,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "m",
         2.2,
         "the scale, the frame rate or the body model is off",
-        "one adult in a million is taller",
+        source="one adult in a million is taller",
     ),
     Check(
         "short_stature",
@@ -208,7 +209,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         0.9,
         "the scale or the body model is off; children younger than three are no "
         "shape of the body model",
-        "adults and children from three years",
+        source="adults and children from three years",
         below=True,
     ),
     Check(
@@ -217,7 +218,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "% of the person's size in the image",
         3.5,
         _IDENTITY_ADVICE,
-        "simulated sequences: at most 2.4, nowhere twice as large as mostly",
+        source="simulated sequences: at most 2.4, nowhere twice as large as mostly",
     ),
     Check(
         "legs_inferred",
@@ -229,8 +230,9 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "regressor's bodies guess them, too, and their steps tell no size. Leave these "
         "frames out (--start, --end; `inferred_frames` of the person in summary.json), "
         "or use no legs of them",
-        "a judgement on rendered people: posture errors in stretches with fewer than "
-        "55 % of knees and ankles measured are twice those of people in full view",
+        source="a judgement on rendered people: posture errors in stretches with "
+        "fewer than 55 % of knees and ankles measured are twice those of "
+        "people in full view",
     ),
     Check(
         "seen_in_pieces",
@@ -240,8 +242,8 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "depths of the pieces do not agree, as little motion ties them: leave these "
         "frames out (--start, --end), or give keypoints of a detector that loses the "
         "person less often",
-        "a judgement: pieces shorter than a second mostly have no prediction by the "
-        "motion model, which reads half a second",
+        source="a judgement: pieces shorter than a second mostly have no "
+        "prediction by the motion model, which reads half a second",
     ),
     Check(
         "appears_within",
@@ -251,8 +253,8 @@ PERSON_CHECKS: tuple[Check, ...] = (
         50.0,
         "two people may have been exchanged there, or one detected twice: look at the "
         "overlay; give keypoints with track ids, or name only the others (--person)",
-        "twenty rendered sequences: 95 where two people were exchanged, 89 where one "
-        "was detected twice, else nobody appears so",
+        source="twenty rendered sequences: 95 where two people were exchanged, 89 "
+        "where one was detected twice, else nobody appears so",
     ),
     Check(
         "speed_across_gap",
@@ -260,7 +262,7 @@ PERSON_CHECKS: tuple[Check, ...] = (
         "m/s",
         10.0,
         _IDENTITY_ADVICE,
-        "sprinters reach 10 to 12 m/s",
+        source="sprinters reach 10 to 12 m/s",
     ),
 )
 MEASURABLE_CHECKS: tuple[Check, ...] = (
@@ -271,9 +273,9 @@ MEASURABLE_CHECKS: tuple[Check, ...] = (
         30.0,
         "people so small cannot be measured: a video of higher resolution, or from "
         "nearer by, or name only the others (--person)",
-        "detectors err by a pixel at least, which at this size is as much as their "
-        "error on the body, 28 mm; rendered people of 15 to 27 px have twice the error "
-        "of large ones",
+        source="detectors err by a pixel at least, which at this size is as much "
+        "as their error on the body, 28 mm; rendered people of 15 to 27 px "
+        "have twice the error of large ones",
         below=True,
     ),
     Check(
@@ -283,7 +285,7 @@ MEASURABLE_CHECKS: tuple[Check, ...] = (
         20.0,
         "people so far away, seen so briefly, have no speed that could be measured: a "
         "longer clip, from nearer by, or name only the others (--person)",
-        "that of all lengths (`scale_sigma`)",
+        source="that of all lengths (`scale_sigma`)",
     ),
 )
 WORLD_CHECKS: tuple[Check, ...] = (
@@ -294,7 +296,7 @@ WORLD_CHECKS: tuple[Check, ...] = (
         0.18,
         "if they do not stand on different floors, sizes of people are off: check the "
         "focal length, or give their bodies (--bodies)",
-        "a judgement: a step or kerb is lower. True people of five simulated "
+        source="a judgement: a step or kerb is lower. True people of five simulated "
         "sequences are within 0.01; estimates from pixels of six rendered "
         "sequences with two people within 0.04, but for one: 0.19, a person 0.1 m off",
     ),
@@ -305,7 +307,7 @@ WORLD_CHECKS: tuple[Check, ...] = (
         7.5,
         "gravity and ground contradict the people: if the ground is not a hill, "
         "postures or focal length are off",
-        "ten simulated sequences: 0.7 to 5",
+        source="ten simulated sequences: 0.7 to 5",
     ),
     Check(
         "up_in_image",
@@ -316,7 +318,7 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "people who lie, hang or stand on their hands are taken for upright, and the "
         "world is turned by as much, unless the video is turned or the camera looks "
         "straight down: turn the video, or use results in the camera's frame only",
-        "six simulated cameras: 6 to 13",
+        source="six simulated cameras: 6 to 13",
     ),
     Check(
         "slope_of_ground",
@@ -325,7 +327,7 @@ WORLD_CHECKS: tuple[Check, ...] = (
         6.0,
         "gravity and ground contradict the people: if the ground is not a hill, "
         "postures or focal length are off",
-        "streets rarely exceed 6",
+        source="streets rarely exceed 6",
     ),
     Check(
         "camera_speed",
@@ -333,7 +335,7 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "m/s",
         10.0,
         _CAMERA_ADVICE,
-        "nobody runs as fast; simulated cameras at most 2.6",
+        source="nobody runs as fast; simulated cameras at most 2.6",
     ),
     Check(
         "camera_acceleration",
@@ -341,7 +343,7 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "m/s²",
         30.0,
         _CAMERA_ADVICE,
-        "simulated hand-held cameras: at most 7",
+        source="simulated hand-held cameras: at most 7",
     ),
     Check(
         "camera_turning",
@@ -349,7 +351,7 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "degrees/s",
         600.0,
         _CAMERA_ADVICE,
-        "simulated hand-held cameras: at most 70; whipping pans 400",
+        source="simulated hand-held cameras: at most 70; whipping pans 400",
     ),
     Check(
         "scale_sigma",
@@ -359,7 +361,7 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "sizes are hardly known: a known focal length, more steps of legs in view, the "
         "ground in view, or a camera path in metres help; so do a regressor's bodies "
         "(--bodies) of people whose legs are in view",
-        "people differ by 5 to 6 %",
+        source="people differ by 5 to 6 %",
     ),
     Check(
         "scale_cues_apart",
@@ -370,8 +372,9 @@ WORLD_CHECKS: tuple[Check, ...] = (
         "their knees bent too much, give the focal length (--focal) or bodies "
         "(--bodies); if soles are not on the floor that the scene shows, people stand "
         "on something else than the map's ground; else check the frame rate (--fps)",
-        "estimates of 13 simulated sequences with bodies, 80 to 240 frames: at most "
-        "1.09; of 40 frames, or without bodies, up to 1.42, within their errors",
+        source="estimates of 13 simulated sequences with bodies, 80 to 240 frames:"
+        " at most 1.09; of 40 frames, or without bodies, up to 1.42, within"
+        " their errors",
     ),
     Check(
         "ground_under_feet",
@@ -380,7 +383,8 @@ WORLD_CHECKS: tuple[Check, ...] = (
         1.4,
         "people do not stand on the ground of the map: scale, postures or focal "
         "length are off, or they stand on something else",
-        "estimates of nine simulated sequences: within 1.02; the limit is a judgement",
+        source="estimates of nine simulated sequences: within 1.02; the limit is a"
+        " judgement",
     ),
     Check(
         "height_over_ground",

@@ -51,13 +51,7 @@ class ScaleRecovery:
         return float(np.ptp(answer) / answer.mean())
 
 
-def scale_recovery(
-    case: Case,
-    perturbations: tuple[float, ...] = PERTURBATIONS,
-    *,
-    schedule: tuple[solver.Stage, ...] = SCHEDULE,
-    prepared: tuple[graph.Problem, graph.State] | None = None,
-) -> ScaleRecovery:
+def scale_recovery(case: Case) -> ScaleRecovery:
     """Estimates s, starting at 1, for cameras of the true size that are scaled by `1/p`
     and held.
 
@@ -66,40 +60,35 @@ def scale_recovery(
     those of the pipeline (the paper uses motion capture), aligned to their true size by
     Sim(3).
     """
-    if prepared is None:
-        found = case.prepare()
-        prepared = without_map(found.problem, found.state, hold_cameras=True)
-    problem, state = prepared
+    found = case.prepare()
+    problem, state = without_map(found.problem, found.state, hold_cameras=True)
     true_size = graph.rescaled(problem, with_scale(state, 1.0), case.map_scale)
     state, history = _recover(
-        jnp.asarray(perturbations),
+        jnp.asarray(PERTURBATIONS),
         *true_size,
         case.truth,
         case.body,
         jnp.asarray(case.bodies.present),
         jnp.asarray(case.cameras.registered),
-        schedule,
     )
     return ScaleRecovery(
-        perturbation=np.array(perturbations),
+        perturbation=np.array(PERTURBATIONS),
         scale=np.asarray(state.scale),
         history=np.asarray(history["scale"]),
         h_ate=np.asarray(history["h_ate"]),
     )
 
 
-def _recover_one(
-    perturbation, problem, state, truth, body, present, registered, schedule
-):
+def _recover_one(perturbation, problem, state, truth, body, present, registered):
     start = graph.rescaled(problem, state, 1 / perturbation)
     observe = lambda y: {
         "scale": y.scale,
         "h_ate": _h_ate(y, truth, body, present, registered),
     }
-    return solver.trace(*start, observe, schedule=schedule)
+    return solver.trace(*start, observe, schedule=SCHEDULE)
 
 
-_recover = solver.vmap_over_devices(_recover_one, (0, *(None,) * 7))
+_recover = solver.vmap_over_devices(_recover_one, (0, *(None,) * 6))
 
 
 def _h_ate(state, truth: Trajectories, body, present, registered):

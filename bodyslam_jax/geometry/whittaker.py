@@ -33,25 +33,24 @@ def low_pass(
     weight = (2 - 2 * np.cos(2 * np.pi * cutoff / fps)) ** -2
     edges = np.flatnonzero(np.diff(present.astype(int), prepend=0, append=0))
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        n = stop - start
+        n = int(stop - start)
         if n < 3:
             continue
-        second = np.diff(np.eye(min(n, 5)), 2, axis=0)
-        corner = weight * second.T @ second
-        bands = np.zeros((3, n))
-        for k in range(3):
-            # Between its ends the matrix has constant diagonals; a run of five frames
-            # gives all distinct entries.
-            row = np.diagonal(corner, k)
-            middle = row[len(row) // 2]
-            full = np.full(n - k, middle)
-            ends = min(2, len(row))
-            full[:ends], full[n - k - ends :] = row[:ends], row[len(row) - ends :]
-            bands[2 - k, k:] = full
+        bands = weight * curvature_bands(n)
         bands[2] += 1.0
         flat = out[start:stop].reshape(n, -1)
         out[start:stop] = solveh_banded(bands, flat).reshape(out[start:stop].shape)
     return out
+
+
+def curvature_bands(n: int) -> Float[np.ndarray, "3 n"]:
+    """Returns the upper bands of `D²ᵀ D²`, for `n` values in a row."""
+    second = np.array([1.0, -2.0, 1.0])
+    bands = np.zeros((3, n))
+    for a in range(3):
+        for b in range(a, 3):
+            bands[2 - (b - a), b : n - 2 + b] += second[a] * second[b]
+    return bands
 
 
 def low_pass_rotations(

@@ -4,8 +4,6 @@ from bodyslam_jax.people.bodies import estimate_bodies as estimate_bodies
 from bodyslam_jax.people.bodies import nobody as nobody
 from bodyslam_jax.people.bodies import select_people as select_people
 from bodyslam_jax.people.bodies import without_bodies as without_bodies
-from bodyslam_jax.people.clean_regressed import BodyNoise as BodyNoise
-from bodyslam_jax.people.clean_regressed import body_noise as body_noise
 from bodyslam_jax.people.clean_regressed import prepare_bodies as prepare_bodies
 from bodyslam_jax.people.definitions import as_body_keypoints as as_body_keypoints
 from bodyslam_jax.people.detect import detect_people as detect_people

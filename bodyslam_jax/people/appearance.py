@@ -91,12 +91,12 @@ def _trunk(points: np.ndarray, least: float) -> Float[np.ndarray, "m 2"]:
 def _thighs(points: np.ndarray, least: float) -> Float[np.ndarray, "m 2"]:
     """Returns positions along both thighs, px, as wide as a third of one."""
     found = [np.zeros((0, 2))]
-    for hip, knee in ((11, 13), (12, 14)):
-        if min(points[hip, 2], points[knee, 2]) <= least:
+    for hip, knee in zip(points[11:13], points[13:15], strict=True):
+        if min(hip[2], knee[2]) <= least:
             continue
-        bone = points[knee, :2] - points[hip, :2]
+        bone = knee[:2] - hip[:2]
         across = 0.08 * np.array([-bone[1], bone[0]])
         along = np.linspace(0.2, 0.9, _GRID_SAMPLES)[:, None, None] * bone
         aside = np.linspace(-1, 1, 4)[None, :, None] * across
-        found.append((points[hip, :2] + along + aside).reshape(-1, 2))
+        found.append((hip[:2] + along + aside).reshape(-1, 2))
     return np.concatenate(found)

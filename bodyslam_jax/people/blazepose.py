@@ -15,6 +15,7 @@ from jaxtyping import Float, UInt8
 INPUT_SIDE_PX = 256
 """Side of the square that the network reads."""
 NUM_LANDMARKS = 33
+"""Number of landmarks that the network has (MODEL_CARD.md)."""
 COCO_OF_LANDMARKS = np.array(
     [0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28]
 )
@@ -76,11 +77,11 @@ def turned_square(points: Float[np.ndarray, "17 3"], least: float) -> Square | N
         least: score from which keypoints are used.
     """
     visible = points[:, 2] > least
-    middle = lambda pair: points[list(pair), :2].mean(0)
-    hips, shoulders = visible[[11, 12]].all(), visible[[5, 6]].all()
-    if not hips or not shoulders:
+    shoulders, hips = slice(5, 7), slice(11, 13)
+    if not (visible[hips].all() and visible[shoulders].all()):
         return None
-    centre, trunk = middle((11, 12)), middle((5, 6)) - middle((11, 12))
+    centre = points[hips, :2].mean(0)
+    trunk = points[shoulders, :2].mean(0) - centre
     length = float(np.linalg.norm(trunk))
     reach = np.linalg.norm(points[visible, :2] - centre, axis=1).max()
     radius = max(_BODY_REACH_FACTOR * float(reach), _TRUNK_REACH_FACTOR * length)
@@ -187,4 +188,5 @@ def _cut(image: np.ndarray, square: Square) -> UInt8[np.ndarray, "256 256 3"]:
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
+    # The exponential of 50 is within single precision (up to 88).
     return 1 / (1 + np.exp(-np.clip(x, -50, 50)))

@@ -5,8 +5,6 @@ are confused in some frames, frames are missing, β varies. Postures are not smo
 that would shorten the steps of a walk, from which the scale is estimated.
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,6 +17,7 @@ from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.geometry.lengths import padded_length
+from bodyslam_jax.geometry.whittaker import curvature_bands
 from bodyslam_jax.people.costs import MIN_DEPTH_M, robust
 from bodyslam_jax.people.hypotheses import find_turned
 from bodyslam_jax.people.keypoint_errors import (
@@ -50,24 +49,6 @@ _PLACING_STEPS = 10
 _REGRESSOR_SHAPE_GAIN = 1.2
 """Regressed shapes are shrunk towards the mean, by a factor of 0.5 to 0.8 with an error
 of 0.3; this gain is about the best linear estimate."""
-
-
-@dataclasses.dataclass(frozen=True)
-class BodyNoise:
-    """Standard deviation of the white part of a regressor's errors, per person.
-
-    It is estimated from second differences, which include true acceleration, and hence
-    an upper bound. The larger, slowly varying part of the errors is not included.
-    """
-
-    orientation: Float[np.ndarray, " h"]
-    """Standard deviation of the orientation, rad per axis."""
-    posture: Float[np.ndarray, " h"]
-    """Standard deviation of joint angles, rad per axis, over all joints."""
-    depth: Float[np.ndarray, " h"]
-    """Standard deviation of the depth, m."""
-    shape: Float[np.ndarray, "h 10"]
-    """Standard deviation of β over the frames."""
 
 
 def prepare_bodies(
@@ -123,33 +104,9 @@ def _shape_gain(bodies: Bodies, settings: PeopleFit) -> float:
     return _REGRESSOR_SHAPE_GAIN if bodies.shapes_regressed else 1.0
 
 
-def body_noise(bodies: Bodies) -> BodyNoise:
-    """Estimates the regressor's jitter from its bodies."""
-    found = []
-    for present, poses, shapes, trans in zip(
-        bodies.present, bodies.poses, bodies.shapes, bodies.trans
-    ):
-        middle = present[1:-1] & present[:-2] & present[2:]
-        if not middle.any():
-            found.append((np.nan, np.nan, np.nan, np.full(10, np.nan)))
-            continue
-        turns = so3.exp(poses.reshape(len(poses), 24, 3))
-        step = so3.log(np.swapaxes(turns[:-1], -1, -2) @ turns[1:])
-        change = np.diff(step, axis=0)[middle]
-        depth = np.diff(trans[:, 2], 2)[middle]
-        found.append(
-            (
-                _spread(change[:, 0]) / np.sqrt(6),
-                _spread(change[:, 1:22]) / np.sqrt(6),
-                _spread(depth) / np.sqrt(6),
-                np.array([_spread(b - np.median(b)) for b in shapes[present].T]),
-            )
-        )
-    return BodyNoise(*(np.array(column, float) for column in zip(*found)))
-
-
 def _spread(values: np.ndarray) -> float:
     """Returns the standard deviation about zero, robustly from the median."""
+    # A normal error has a median absolute value of 1 / 1.4826 standard deviations.
     return 1.4826 * float(np.median(np.abs(values)))
 
 
@@ -246,6 +203,7 @@ def _smooth(
     `where`."""
     depth = position[:, 2]
     mean_depth = float(np.median(depth))
+    # From 30 fps, where the jitters are stated: a random acceleration.
     slow = (30 / fps) ** 1.5
     across = POSITION_JITTER_M * slow / mean_depth
     coordinates = np.column_stack([position[:, :2] / depth[:, None], depth])
@@ -272,11 +230,7 @@ def _smooth_curve(
     index = where - where[0]
     noise = max(_spread(np.diff(values, 2)) / np.sqrt(6), 0.1 * jitter)
     sigma = noise * np.sqrt(10.0)
-    difference = np.array([1.0, -2.0, 1.0]) / jitter
-    stiffness = np.zeros((3, total))
-    for a in range(3):
-        for b in range(a, 3):
-            stiffness[2 - (b - a), b : total - 2 + b] += difference[a] * difference[b]
+    stiffness = curvature_bands(int(total)) / jitter**2
     filled = np.interp(np.arange(total), index, values)
     weight = np.zeros(total)
     weight[index] = sigma**-2

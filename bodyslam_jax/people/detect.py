@@ -47,13 +47,13 @@ DETECTOR = Model(
     "yolox_s.onnx",
     "https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0/yolox_s.onnx",
     "c5c2d13e59ae883e6af3b45daea64af4833a4951c92d116ec270d9ddbe998063",
-    36,
+    36,  # MB, the size of the file
 )
 POSE = Model(
     "dw-ll_ucoco_384.onnx",
     "https://huggingface.co/yzd-v/DWPose/resolve/main/dw-ll_ucoco_384.onnx",
     "724f4ff2439ed61afb86fb8a1951ec39c6220682803b4a8bd4f598cd913b1843",
-    134,
+    134,  # MB, the size of the file
 )
 
 _MIN_SCORE = 0.5
@@ -63,10 +63,15 @@ _MAX_OVERLAP = 0.45
 _MAX_PEOPLE = 8
 """Number of people per image whose keypoints are estimated, the largest first."""
 _STRIDES = (8, 16, 32)
+"""Cells of YOLOX's three grids, px of its input (Ge et al., 2021)."""
 _PAD = 114
+"""Grey level beyond the image, as in YOLOX's own preprocessing."""
 _CROP_MARGIN = 1.25
+"""Side of the crop over that of the box: RTMPose's own (Jiang et al., 2023)."""
+# ImageNet's, as RTMPose was trained: red, green, blue.
 _MEAN = np.array([123.675, 116.28, 103.53], np.float32)
 _STD = np.array([58.395, 57.12, 57.375], np.float32)
+"""Standard deviations, likewise."""
 _SIMCC_SPLIT = 2.0
 """Bins of SimCC per pixel of the crop."""
 
@@ -241,6 +246,7 @@ def to_body25(points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "25 3"]:
     The neck is the midpoint of the shoulders, the mid-hip that of the hips.
     """
     count = len(points)
+    # COCO, Halpe, COCO-WholeBody.
     if count not in (17, 26, 133):
         raise InputError(f"pose: {count} keypoints, expected 17, 26 or 133.")
     layout = usual_layout(count)
@@ -284,7 +290,7 @@ def _fetch(model: Model, path: Path) -> None:
         urllib.request.urlopen(model.url, timeout=30) as source,
         partial.open("wb") as target,
     ):
-        while block := source.read(1 << 20):
+        while block := source.read(2**20):
             target.write(block)
 
 

@@ -9,6 +9,7 @@ search is also tracked backwards to the previous search.
 import dataclasses
 from collections import deque
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -31,19 +32,19 @@ from bodyslam_jax.people.regions import behind, covered, regions, square_around
 from bodyslam_jax.people.tracking import Tracker, Tracklet, between, height
 from bodyslam_jax.sfm import SILHOUETTE_STEP
 
-_SEARCH_INTERVAL_S = 0.33
+SEARCH_INTERVAL_S = 0.33
 """Time between two searches of the whole image."""
 _MAX_PEOPLE = 8
 """Number of people that are followed, the largest ones first."""
-_COARSE_INPUT_PX, _SEARCH_INPUT_PX, _FINE_INPUT_PX = 320, 640, 1280
+COARSE_INPUT_PX, _SEARCH_INPUT_PX, _FINE_INPUT_PX = 320, 640, 1280
 """Longer side of the image in MoveNet's input: for people who fill the image, for most,
 and for small ones."""
 _FINE_SEARCH_PERIOD = 3
 """Every how many searches small people are searched for, too."""
 _MAX_PERSON_PX = 250.0
 """Size in MoveNet's input above which it splits a person into several."""
-_SQUARE_INPUT_PX = 256
-_MIN_START_SCORE, _MIN_CONTINUE_SCORE, _MIN_MASK_SCORE = 0.22, 0.12, 0.1
+SQUARE_INPUT_PX = 256
+MIN_START_SCORE, MIN_CONTINUE_SCORE, _MIN_MASK_SCORE = 0.22, 0.12, 0.1
 """Least score of MoveNet that begins a track, that continues one, and that masks the
 person in the images. Without people, scores are 0.00 to 0.07."""
 _MIN_SEARCH_GAP_FRAMES = 3
@@ -54,10 +55,10 @@ person's."""
 _MIN_RELATIVE_VISIBILITY = 0.03
 """Least visibility (size times confidence, summed over time) of a person who is
 estimated, relative to that of the most visible person."""
-_MIN_REPORTED_TRACK_S = 0.2
+MIN_TRACK_S = 0.2
 """Shorter tracks are masked without a warning, as they may be false detections."""
 _MIN_PRESENCE = 0.5
-_Detections = tuple[Float[np.ndarray, "n 17 3"], Float[np.ndarray, " n"]]
+Detections = tuple[Float[np.ndarray, "n 17 3"], Float[np.ndarray, " n"]]
 """COCO keypoints, and a score for each person."""
 
 
@@ -107,7 +108,7 @@ class _Finder:
         self.fps, self.settings, self.association = fps, settings, association
         self.whom = settings.min_height, _MAX_PEOPLE
         self.tracker = Tracker(fps, association.max_gap)
-        self.interval = max(1, round(_SEARCH_INTERVAL_S * fps))
+        self.interval = max(1, round(SEARCH_INTERVAL_S * fps))
         self.next_search, self.last_search, self.searches = (
             0,
             -_MIN_SEARCH_GAP_FRAMES,
@@ -125,18 +126,17 @@ class _Finder:
         now = _Frame(image, np.zeros(size, bool), {}, [])
         expected = [t.expected(k, self.fps) for t in self.tracker.alive(k)]
         found = [
-            self._look(image, r, _SQUARE_INPUT_PX)
-            for r in regions(expected, *self.whom)
+            self._look(image, r, SQUARE_INPUT_PX) for r in regions(expected, *self.whom)
         ]
         if k >= self.next_search:
             found += self._search(image)
             self.last_search, self.next_search = k, k + self.interval
-        points, score = _merged(found)
+        points, score = merged(found)
         looks = self._looks(image, points)
         first_new = len(self.tracker.tracklets)
         clear = ~behind(points, score)
         who = self.tracker.update(
-            k, points, looks, clear, clear & (score >= _MIN_START_SCORE)
+            k, points, looks, clear, clear & (score >= MIN_START_SCORE)
         )
         for row, number in zip(points, who.tolist(), strict=True):
             if number < 0:
@@ -191,7 +191,7 @@ class _Finder:
             if any(pieces is p for p in people):
                 continue
             track = _track(pieces)
-            if len(track) >= _MIN_REPORTED_TRACK_S * self.fps:
+            if len(track) >= MIN_TRACK_S * self.fps:
                 others += not is_stray(track, tracks, gap, MIN_SURE_SCORE)
         if others > 0:
             warnings.append(
@@ -223,11 +223,11 @@ class _Finder:
     def _is_phantom(self, pieces: list[Tracklet]) -> bool:
         return is_phantom(pieces, set(self.feet), self.fps)
 
-    def _search(self, image: np.ndarray) -> list[_Detections]:
+    def _search(self, image: np.ndarray) -> list[Detections]:
         """Returns the people anywhere in the image."""
         whole = (0, 0, image.shape[1], image.shape[0])
         longest = max(image.shape[:2])
-        found = [self._look(image, whole, _COARSE_INPUT_PX)]
+        found = [self._look(image, whole, COARSE_INPUT_PX)]
         found.append(self._look(image, whole, _SEARCH_INPUT_PX))
         if (
             longest > 1.3 * _SEARCH_INPUT_PX
@@ -237,12 +237,12 @@ class _Finder:
         self.searches += 1
         return found
 
-    def _look(self, image: np.ndarray, region: Region, longer: int) -> _Detections:
+    def _look(self, image: np.ndarray, region: Region, longer: int) -> Detections:
         points, score = movenet.find_people(self.movenet, image, region, longer)
         scale = longer / max(region[2] - region[0], region[3] - region[1])
         sizes = np.array([movenet.box_size(p) for p in points])
         kept = score >= _MIN_MASK_SCORE
-        if longer > _COARSE_INPUT_PX:
+        if longer > COARSE_INPUT_PX:
             kept &= sizes * scale <= _MAX_PERSON_PX
         return points[kept], score[kept]
 
@@ -260,15 +260,12 @@ class _Finder:
         """Records a person in a frame, with feet and silhouette if BlazePose confirms
         the person."""
         frame.tracked[number] = points
-        square = blazepose.turned_square(points, movenet.MIN_SURE_SCORE)
-        if square is None or height(points) < MIN_CONFIRMED_HEIGHT_PX:
+        if height(points) < MIN_CONFIRMED_HEIGHT_PX:
             return
-        pose = blazepose.read_pose(self.blazepose, frame.image, square)
-        apart = blazepose.disagreement(pose, points)
-        sure = sure_points(points)
-        if pose.presence < _MIN_PRESENCE or np.median(apart[sure]) > MAX_DISAGREEMENT:
+        found = confirmed(self.blazepose, frame.image, points)
+        if found is None:
             return
-        self.feet[number, k] = find_feet(pose, points, apart)
+        pose, self.feet[number, k] = found
         size = frame.image.shape[0], frame.image.shape[1]
         frame.mask |= blazepose.mask_in_image(pose, size, SILHOUETTE_STEP) > 0
 
@@ -277,8 +274,8 @@ class _Finder:
         tracklet = self.tracker.tracklets[number]
         for index, frame in reversed(self.recent):
             first = tracklet.points[0]
-            near = self._look(frame.image, square_around(first), _SQUARE_INPUT_PX)
-            points, score = _merged([near])
+            near = self._look(frame.image, square_around(first), SQUARE_INPUT_PX)
+            points, score = merged([near])
             looks = self._looks(frame.image, points)
             cost = [
                 self.tracker.cost_before(tracklet, p, look)
@@ -286,7 +283,7 @@ class _Finder:
             ]
             best = int(np.argmin(cost)) if cost else 0
             taken = frame.tracked.values()
-            if not cost or cost[best] >= 1 or score[best] < _MIN_CONTINUE_SCORE:
+            if not cost or cost[best] >= 1 or score[best] < MIN_CONTINUE_SCORE:
                 return
             if any(movenet.same_person(points[best], p) for p in taken):
                 return
@@ -295,12 +292,26 @@ class _Finder:
             self.masks[index] = np.packbits(frame.mask, axis=1)
 
 
-def _merged(found: list[_Detections]) -> _Detections:
+def confirmed(
+    session: Any, image: UInt8[np.ndarray, "y x 3"], points: Float[np.ndarray, "17 3"]
+) -> tuple[blazepose.Pose, Float[np.ndarray, "4 3"]] | None:
+    """Returns BlazePose's view of a person with these keypoints, and heel and big toe
+    of both sides; `None` if it does not see the same person there."""
+    square = blazepose.turned_square(points, MIN_SURE_SCORE)
+    if square is None:
+        return None
+    pose = blazepose.read_pose(session, image, square)
+    apart = blazepose.disagreement(pose, points)
+    unlike = np.median(apart[sure_points(points)]) > MAX_DISAGREEMENT
+    if pose.presence < _MIN_PRESENCE or unlike:
+        return None
+    return pose, find_feet(pose, points, apart)
+
+
+def merged(found: list[Detections]) -> Detections:
     """Returns the detections of several searches without duplicates."""
-    if not found:
-        return np.zeros((0, 17, 3)), np.zeros(0)
-    points = np.concatenate([p for p, _ in found])
-    score = np.concatenate([s for _, s in found])
+    points = np.concatenate([np.zeros((0, 17, 3)), *(p for p, _ in found)])
+    score = np.concatenate([np.zeros(0), *(s for _, s in found)])
     kept = movenet.distinct(points, score)
     return points[kept], score[kept]
 

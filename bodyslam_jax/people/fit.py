@@ -284,7 +284,7 @@ def make_ties(prior: PosturePrior, cuts: np.ndarray, frames: int, fps: float) ->
     weight, c1, c2 = np.zeros((3, frames, size))
     jitter = (
         np.array([_TURN_JITTER_RAD] * 3 + [POSITION_JITTER_M] * 2 + [DEPTH_JITTER_M])
-        * (30 / fps) ** 1.5
+        * (30 / fps) ** 1.5  # From 30 fps, where jitters are stated.
     )
     loose = _MOTION_SCALE**2
     weight[:, :6], c1[:, :6], c2[:, :6] = jitter**-2, -2.0, 1.0

@@ -49,14 +49,11 @@ this bound, and it does not update the filter."""
 _HYPOTHESIS_FRAMES = 5
 """Hypotheses with the same states in this number of last frames are merged: the most
 likely one is kept."""
-_ERROR_CORRELATION_S = 1 / 3
-"""Correlation time of errors of keypoints against a posture: frames within it count
-once."""
 _MAX_FRAME_COST = 8.0
 """Negative log odds that all keypoints of a frame are wrong, which bounds a frame's
-evidence."""
-_MEDIAN_SQUARED_NORM = 1.386
-"""Median squared norm of a vector with two standard normal components."""
+evidence. With the evidence also divided by the keypoints' noise and by the number of
+frames within 1/3 s, twice as many frames were read wrongly (`benchmarks/keypoints.md`).
+"""
 
 
 def correct_left_right(
@@ -100,18 +97,9 @@ def find_turned(
         robust_scale: scale of Geman and McClure's loss on keypoints, in standard
             deviations.
     """
-    seconds = float(np.median(np.diff(time))) if len(time) > 1 else _ERROR_CORRELATION_S
-    robust = lambda squared: squared / (1 + squared / robust_scale**2)
-    detected = np.isfinite(sigma)
     squared = np.sum((predicted - uv[:, None]) ** 2, -1) / sigma[:, None] ** 2
-    costs = np.zeros(squared.shape[:2])
-    if detected.any():
-        better = np.argmin(robust(squared).sum(-1), axis=1)
-        residual = squared[np.arange(len(uv)), better][detected]
-        noise = max(1.0, float(np.median(residual)) / _MEDIAN_SQUARED_NORM)
-        costs = 0.5 * robust(squared / noise).sum(-1)
-        costs = np.minimum(costs - costs.min(axis=1, keepdims=True), _MAX_FRAME_COST)
-    costs *= min(1.0, seconds / _ERROR_CORRELATION_S)
+    costs = 0.5 * np.sum(squared / (1 + squared / robust_scale**2), axis=-1)
+    costs = np.minimum(costs - costs.min(axis=1, keepdims=True), _MAX_FRAME_COST)
     return are_errors(costs, joints[:, :, _LIMB_JOINTS], time, _POSITION_SIGMA_M)
 
 

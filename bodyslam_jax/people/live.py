@@ -12,26 +12,29 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from bodyslam_jax.config import Association, Detect
-from bodyslam_jax.people import blazepose, movenet
+from bodyslam_jax.io.keypoints.layouts import LAYOUTS
+from bodyslam_jax.people import movenet
 from bodyslam_jax.people.appearance import DESCRIPTOR_SIZE, describe, difference
-from bodyslam_jax.people.found import MAX_DISAGREEMENT, as_body25, find_feet
+from bodyslam_jax.people.find import (
+    COARSE_INPUT_PX,
+    MIN_CONTINUE_SCORE,
+    MIN_START_SCORE,
+    MIN_TRACK_S,
+    SEARCH_INTERVAL_S,
+    SQUARE_INPUT_PX,
+    confirmed,
+    merged,
+)
+from bodyslam_jax.people.found import as_body25
 from bodyslam_jax.people.movenet import MIN_SURE_SCORE, sure_points
 from bodyslam_jax.people.networks import BLAZEPOSE, MOVENET, open_network
 from bodyslam_jax.people.regions import behind, regions
 from bodyslam_jax.people.tracking import MAX_COLOUR_DIFFERENCE, Tracker, height
 
-_SEARCH_INTERVAL_S, _SEARCH_INTERVAL_TRACKED_S = 0.33, 1.0
-"""Time between two searches of the whole image, s: while nobody is tracked, and
-otherwise."""
-_IMAGE_SIDE_PX, _SQUARE_SIDE_PX = 320, 256
-"""Longer side of MoveNet's input, px: of the whole image, and of a square."""
-_MIN_START_SCORE, _MIN_SCORE = 0.22, 0.12
-"""Least score of a detection that begins a track, and of one that continues it."""
+_SEARCH_INTERVAL_TRACKED_S = 1.0
+"""Time between two searches of the whole image while somebody is tracked, s."""
 _MAX_PEOPLE = 4
 """Largest number of tracked people; the largest ones in the image are kept."""
-_MIN_PRESENCE = 0.5
-_MIN_TRACK_S = 0.2
-"""Least duration of the track of a person, s."""
 _MAX_CLOTHES_DIFFERENCE = 0.6 * MAX_COLOUR_DIFFERENCE
 """Largest difference of colours of a person who returns."""
 _MAX_ABSENCE_S = 5.0
@@ -39,7 +42,7 @@ _MAX_ABSENCE_S = 5.0
 s."""
 _MAX_DETECTIONS = 45
 """Number of detections of a track that are kept."""
-_BODY25_OF_COCO = np.array([0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11])
+_BODY25_OF_COCO = np.array(LAYOUTS[movenet.NUM_KEYPOINTS]["COCO"].parts)
 """BODY_25's keypoint of each of COCO's."""
 
 
@@ -84,22 +87,19 @@ class LivePeople:
         alive = self.tracker.alive(self.frame)
         expected = [t.expected(self.frame, self.fps) for t in alive]
         squares = regions(expected, self.settings.min_height, _MAX_PEOPLE)
-        found = [self._look(image, r, _SQUARE_SIDE_PX) for r in squares]
+        found = [self._look(image, r, SQUARE_INPUT_PX) for r in squares]
         if self.frame >= self.next_search:
             whole = 0, 0, image.shape[1], image.shape[0]
-            found.append(self._look(image, whole, _IMAGE_SIDE_PX))
-            wait = _SEARCH_INTERVAL_TRACKED_S if squares else _SEARCH_INTERVAL_S
+            found.append(self._look(image, whole, COARSE_INPUT_PX))
+            wait = _SEARCH_INTERVAL_TRACKED_S if squares else SEARCH_INTERVAL_S
             self.next_search = self.frame + max(1, round(wait * self.fps))
-        points = np.concatenate([np.zeros((0, 17, 3)), *(p for p, _ in found)])
-        score = np.concatenate([np.zeros(0), *(s for _, s in found)])
-        kept = movenet.distinct(points, score)
-        points, score = points[kept], score[kept]
+        points, score = merged(found)
         large = np.array([height(p) >= self.settings.min_height for p in points], bool)
         points, score = points[large], score[large]
         looks = [describe(image, p, MIN_SURE_SCORE) for p in points]
         looks = np.array(looks).reshape(-1, DESCRIPTOR_SIZE)
         clear = ~behind(points, score)
-        who = self._track(points, looks, clear, clear & (score >= _MIN_START_SCORE))
+        who = self._track(points, looks, clear, clear & (score >= MIN_START_SCORE))
         return {person: self._whole(image, points[row]) for row, person in who.items()}
 
     def given(
@@ -124,7 +124,7 @@ class LivePeople:
     ) -> tuple[np.ndarray, np.ndarray]:
         assert self.networks is not None
         points, score = movenet.find_people(self.networks[0], image, region, longer)
-        kept = score >= _MIN_SCORE
+        kept = score >= MIN_CONTINUE_SCORE
         return points[kept], score[kept]
 
     def _whole(
@@ -132,17 +132,8 @@ class LivePeople:
     ) -> Float[np.ndarray, "25 3"]:
         """Returns BODY_25, with the feet that BlazePose finds."""
         assert self.networks is not None
-        square = blazepose.turned_square(points, MIN_SURE_SCORE)
-        if square is None:
-            return as_body25(points, None)
-        pose = blazepose.read_pose(self.networks[1], image, square)
-        apart = blazepose.disagreement(pose, points)
-        if (
-            pose.presence < _MIN_PRESENCE
-            or np.median(apart[sure_points(points)]) > MAX_DISAGREEMENT
-        ):
-            return as_body25(points, None)
-        return as_body25(points, find_feet(pose, points, apart))
+        found = confirmed(self.networks[1], image, points)
+        return as_body25(points, None if found is None else found[1])
 
     def _track(
         self,
@@ -170,7 +161,7 @@ class LivePeople:
                 known.look = self.tracker.tracklets[number].look
                 return person
         track = self.tracker.tracklets[number]
-        if len(track.frames) < max(2, round(_MIN_TRACK_S * self.fps)):
+        if len(track.frames) < max(2, round(MIN_TRACK_S * self.fps)):
             return None
         look, person = track.look, len(self.persons)
         away = [

@@ -16,6 +16,7 @@ NUM_KEYPOINTS = 17
 """Number of COCO keypoints, in COCO's order: nose, eyes, ears, shoulders, elbows,
 wrists, hips, knees, ankles, left before right."""
 _INPUT_MULTIPLE_PX = 32
+"""Divisor of the sides that the network's input may have."""
 _KEYPOINT_SHIFT_PX = -0.25
 """Shift in the network's input, added to `relative place x size`: half a pixel is from
 pixel edges to centres, and a quarter back is the network's own offset, from images and
@@ -136,6 +137,8 @@ def sure_points(points: Float[np.ndarray, "17 3"]) -> Bool[np.ndarray, " 17"]:
 
 
 MIN_SURE_SCORE = 0.15
+"""Score up to which a keypoint's place is a guess: at 0.2 it errs by 4 to 9 % of a
+person's height (`found.confidence`)."""
 
 
 def box(points: Float[np.ndarray, "17 3"]) -> Float[np.ndarray, " 4"]:

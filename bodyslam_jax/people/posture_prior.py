@@ -24,6 +24,7 @@ ASSET = Path(__file__).parent / "assets" / "posture_prior.npz"
 BASIS = ASSET.with_name("posture_basis.npz")
 NUM_HANDS = 2
 _TRAINED_AT = 30.0
+"""Frame rate of the stored autoregression, 1/s (`tools/make_posture_prior.py`)."""
 
 
 class PosturePrior(eqx.Module):
@@ -78,6 +79,7 @@ def _read() -> dict[str, np.ndarray]:
 _NAMES = ("mean", "basis", "lower", "upper", "autoregression")
 
 
+# The 40 directions that keypoints determine span 97 % of the distance (see below).
 def posture_basis(count: int = 40) -> Float[np.ndarray, "69 k"]:
     """Returns the directions of the joints' rotations along which estimates of postures
     differ from initial guesses, in decreasing order of that difference: orthonormal

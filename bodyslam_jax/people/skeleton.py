@@ -43,10 +43,6 @@ def _paths() -> np.ndarray:
 _PATH_MATRIX = _paths()
 
 
-# Offsets of a detector's keypoints from SMPL's, constant for a detector and person:
-# keypoints, axis of the bone they are attached to, prior standard deviation (m).
-# Mirrored in x. They are estimated as extra shape components; without them an offset
-# of the hip of 3 cm would appear as legs bent by 20 degrees.
 _OFFSETS = (
     *(((9, 12), axis, sigma) for axis, sigma in ((0, 0.02), (1, 0.04), (2, 0.02))),
     *(((2, 5), axis, sigma) for axis, sigma in ((0, 0.02), (1, 0.025), (2, 0.02))),
@@ -59,6 +55,12 @@ _OFFSETS = (
     *(((19, 20, 22, 23), axis, 0.02) for axis in (1, 2)),
     *(((21, 24), axis, 0.015) for axis in (1, 2)),
 )
+"""Offsets of a detector's keypoints from SMPL's, constant for a detector and person:
+keypoints, axis of the bone they are attached to, prior standard deviation (m), mirrored
+in x. They are estimated as extra shape components; without them an offset of the hip of
+3 cm would appear as legs bent by 20 degrees. The deviations are as large as what the
+detectors' definitions differ by from the joints, 0 to 3.8 % of the stature along an
+axis and 1.2 to 2.0 % after the definition (`benchmarks/keypoints.md`)."""
 NUM_SHAPE = 10 + len(_OFFSETS)
 """Number of shape components: β, then the detector's offsets in standard deviations."""
 _LEFT_KEYPOINTS = (5, 6, 7, 12, 13, 14, 16, 18, 19, 20, 21)

@@ -138,8 +138,10 @@ def stand_on_plane(
         level[group] = np.median(feet) if len(feet) else 0.0
     offset = level + wander(height, used, fps)[0]
     away = np.abs(height - offset)
+    # A normal error has a median absolute value of 1 / 1.4826 standard deviations.
     spread = max(1.4826 * float(np.median(away[used])) / _MAX_HEIGHT_SCATTER_M, 1.0)
     near = used & (away < 3 * spread * _MAX_HEIGHT_SCATTER_M)
+    # Of a frame of 1/30 s, constant over a stance: variances grow with the rate.
     sigma = _HEIGHT_SIGMA_M * spread * np.sqrt(fps / 30.0)
     sigma = np.where(near, sigma / np.sqrt(np.maximum(stands, 0.5)), np.inf)
     shifted = np.asarray(contact.offset) - offset / float(state.scale)

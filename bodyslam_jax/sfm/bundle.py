@@ -38,6 +38,13 @@ class Views:
         return Views(self.frame[index], self.landmark[index], self.xy[index])
 
 
+def rows_by(index: Int[np.ndarray, " m"], num: int) -> list[Int[np.ndarray, " n"]]:
+    """Returns, for each number below `num`, the rows of `index` that have it."""
+    order = np.argsort(index, kind="stable")
+    ends = np.searchsorted(index[order], np.arange(1, num + 1))
+    return np.split(order, ends)[:num]
+
+
 ERROR_PER_SIGMA = 1.18
 """Median length of a vector of two normal errors, in units of their sigma."""
 _MIN_DEPTH = 1e-6

@@ -18,12 +18,15 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from bodyslam_jax.geometry.triangulation import unit_rays
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
-from bodyslam_jax.sfm.multiview import fit_rotation
+from bodyslam_jax.sfm.bundle import rows_by
+from bodyslam_jax.sfm.multiview import essential_matrix, fit_rotation, sampson
 from bodyslam_jax.types import Intrinsics, Tracks
 
-MAX_STILL_DISPLACEMENT_PX = 0.5
-"""Largest displacement of a point that counts as still, px: assumes tracking noise
-below 0.2 px (1 σ) and is scaled with larger images; 2.5 σ of noisier tracks instead."""
+_TRACK_SIGMA_PX = 0.2
+"""Tracking noise that is assumed, px (1 σ)."""
+MAX_STILL_DISPLACEMENT_PX = 2.5 * _TRACK_SIGMA_PX
+"""Largest displacement of a point that counts as still, px: 2.5 σ of the assumed noise,
+scaled with larger images, or as many of noisier tracks."""
 _PAIR_GAPS_FRAMES = (6, 15, 30, 60)
 """Distances, in frames, of the two frames of a pair."""
 _MAX_ANCHORS = 300
@@ -80,12 +83,16 @@ def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> Bu
     stays, pairs = np.zeros(num, np.int64), np.zeros(num, np.int64)
     total, telling, resting = np.zeros(num), 0, 0
     size = (intrinsics.width, intrinsics.height)
-    limit = max(still_limit(size), 2.5 * noise_of(tracks))
-    by_frame = _by_frame(tracks, num_frames)
+    noise = noise_of(tracks)
+    limit = max(still_limit(size), MAX_STILL_DISPLACEMENT_PX / _TRACK_SIGMA_PX * noise)
+    of_frame = rows_by(tracks.frame, num_frames)
     K, distortion = as_opencv(intrinsics.params)
     for a, b in _pairs(num_frames):
-        ids, i, j = np.intersect1d(by_frame[a][0], by_frame[b][0], return_indices=True)
-        at_a, at_b = by_frame[a][1][i], by_frame[b][1][j]
+        in_a, in_b = of_frame[a], of_frame[b]
+        ids, i, j = np.intersect1d(
+            tracks.landmark[in_a], tracks.landmark[in_b], return_indices=True
+        )
+        at_a, at_b = tracks.uv[in_a[i]], tracks.uv[in_b[j]]
         moved = np.linalg.norm(at_b - at_a, axis=-1)
         still = moved < limit
         pairs[ids] += 1
@@ -225,30 +232,13 @@ def _contradiction(
         scatter = max(limit, 1.5 * float(np.median(away)))
         left = np.linalg.norm(unit_rays(xy_b) - unit_rays(xy_a) @ R.T, axis=-1)
         return left / scatter, fits
-    E, inlier = cv2.findEssentialMat(
-        a, b, np.eye(3), cv2.USAC_MAGSAC, 0.999, 2 * limit, 500
-    )
+    E, inlier = essential_matrix(a, b, 2 * limit)
     if E is None or E.shape != (3, 3) or inlier is None or inlier.mean() < 0.5:
         return None, fits
     fits[movers] = inlier.ravel() > 0
     left = sampson(E, xy_a, xy_b)
     scatter = max(limit, 1.5 * float(np.median(left[fits])))
     return left / scatter, fits
-
-
-def sampson(
-    E: Float[np.ndarray, "3 3"],
-    xy_a: Float[np.ndarray, "n 2"],
-    xy_b: Float[np.ndarray, "n 2"],
-) -> Float[np.ndarray, " n"]:
-    """Returns the first-order distance of each pair from the epipolar constraint, at
-    depth 1."""
-    one = np.ones((len(xy_a), 1))
-    a, b = np.concatenate([xy_a, one], axis=-1), np.concatenate([xy_b, one], axis=-1)
-    at_b, at_a = a @ E.T, b @ E
-    value = np.einsum("ni,ni->n", b, at_b)
-    norm = np.sqrt((at_b[:, :2] ** 2).sum(axis=-1) + (at_a[:, :2] ** 2).sum(axis=-1))
-    return np.abs(value) / np.maximum(norm, 1e-12)
 
 
 def _covers(
@@ -261,14 +251,3 @@ def _covers(
     if min(len({cell[i] for cell in moving}) for i in (0, 1)) < _MIN_COVER_ROWS:
         return False
     return len(moving) >= max(4, _MIN_COVER_RATIO * len(staying - moving))
-
-
-def _by_frame(
-    tracks: Tracks, num_frames: int
-) -> list[tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]]:
-    order = np.argsort(tracks.frame, kind="stable")
-    bounds = np.searchsorted(tracks.frame[order], np.arange(num_frames + 1))
-    return [
-        (tracks.landmark[order[i:j]], tracks.uv[order[i:j]])
-        for i, j in zip(bounds[:-1], bounds[1:], strict=True)
-    ]

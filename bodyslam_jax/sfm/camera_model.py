@@ -369,8 +369,8 @@ def _changes(given: Intrinsics, used: Intrinsics) -> list[str]:
             f"the tracks indicate fx/fy = {after:.3f} where {source} has {before:.3f} "
             "(pixels that are not square: a stretched video): used."
         )
-    k1 = used.params[4] if len(used.params) == 8 else 0.0
-    assumed = given.params[4] if len(given.params) == 8 else 0.0
+    k1 = used.params[4] if len(used.params) > 4 else 0.0
+    assumed = given.params[4] if len(given.params) > 4 else 0.0
     if abs(k1 - assumed) > 1e-6:
         text.append(
             f"the tracks indicate a distorted lens, k1 = {k1:.3f} where {source} "

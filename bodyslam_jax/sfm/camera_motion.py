@@ -5,15 +5,19 @@ from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.geometry.triangulation import unit_rays
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
-from bodyslam_jax.sfm.bundle import Views
+from bodyslam_jax.sfm.bundle import Views, rows_by
 from bodyslam_jax.sfm.multiview import fit_rotation
 from bodyslam_jax.types import Intrinsics, Tracks
 
+KEYFRAME_MOTION_SHARE = 0.03
+"""Motion of points between keyframes, as a share of the image's longer side."""
 _MIN_FOLLOWED_SHARE = 0.05
 """Least share of points that are tracked from frame to frame, however quick the
 motion."""
 _LOW_FOLLOWED_SHARE = 0.3
 """Share of tracked points below which a displacement half as large is a cut."""
+_WINDOW_FRAMES = 10
+"""Number of frames over which a place is averaged by its median."""
 _JUMP_LIMITS = 10.0, 0.08
 """A displacement between frames is a cut beyond this multiple of the median
 displacement, if it is also beyond this distance at depth 1."""
@@ -66,11 +70,11 @@ def choose_keyframes(
 ) -> Int[np.ndarray, " k"]:
     """Returns frames between which points moved by `motion` (at depth 1), or many of
     which are new."""
-    by_frame = _by_frame(views)
+    by_frame = _by_frame(views, last + 1)
     chosen = [first]
-    ids, xy = by_frame.get(first, _nothing())
+    ids, xy = by_frame[first]
     for k in range(first + 1, last + 1):
-        ids_k, xy_k = by_frame.get(k, _nothing())
+        ids_k, xy_k = by_frame[k]
         _, a, b = np.intersect1d(ids, ids_k, return_indices=True)
         if len(ids_k) < min_shared:
             continue
@@ -88,9 +92,9 @@ def choose_keyframes(
     return np.asarray(chosen)
 
 
-def stillness(views: Views, window: int = 10) -> float:
+def stillness(views: Views) -> float:
     """Returns the image motion of points at depth 1: the median of the largest distance
-    between their median position in the first `window` frames and in any later ones.
+    between their median position in the first ten frames and in any later ones.
 
     Medians over windows suppress tracking noise, so that noise of 0.5 px at 640x480
     stays below the limit of a static camera.
@@ -103,7 +107,7 @@ def stillness(views: Views, window: int = 10) -> float:
     wander = []
     for start, length in zip(starts[long], lengths[long], strict=True):
         points = xy[start : start + length]
-        parts = np.array_split(points, max(2, length // window))
+        parts = np.array_split(points, max(2, length // _WINDOW_FRAMES))
         medians = np.array([np.median(part, axis=0) for part in parts])
         wander.append(np.linalg.norm(medians - medians[0], axis=-1).max())
     return float(np.median(wander)) if wander else np.inf
@@ -127,7 +131,7 @@ def rotation_error(
     Rows are of pairs that share 30 points or more: first and second frame, the median
     residual angle (rad) of the best rotation, and the number of shared points.
     """
-    by_frame = _by_frame(views)
+    by_frame = _by_frame(views, int(max(keyframes, default=0)) + 1)
     rows = []
     for i, a in enumerate(keyframes):
         for b in keyframes[i + 1 :]:
@@ -159,13 +163,13 @@ def rotations_only(
     `turns` the rotations are the identity. Returns rotations, directions, and which
     frames were solved.
     """
-    by_frame = _by_frame(views)
+    by_frame = _by_frame(views, num_frames)
     R = np.tile(np.eye(3), (num_frames, 1, 1))
     direction = np.zeros((num_landmarks, 3))
     has_direction = np.zeros(num_landmarks, dtype=bool)
     solved = np.zeros(num_frames, dtype=bool)
     for k in range(num_frames):
-        ids, xy = by_frame.get(k, _nothing())
+        ids, xy = by_frame[k]
         ray = unit_rays(xy)
         at = has_direction[ids]
         if solved.any():
@@ -191,16 +195,9 @@ def rotations_only(
     return R, direction, solved
 
 
-def _by_frame(views: Views) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    order = np.argsort(views.frame, kind="stable")
-    frame = views.frame[order]
-    starts = np.flatnonzero(np.diff(frame, prepend=-1))
-    ends = np.append(starts[1:], len(frame))
-    return {
-        int(frame[a]): (views.landmark[order[a:b]], views.xy[order[a:b]])
-        for a, b in zip(starts, ends, strict=True)
-    }
-
-
-def _nothing() -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros(0, dtype=np.int64), np.zeros((0, 2))
+def _by_frame(
+    views: Views, num: int
+) -> list[tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]]:
+    """Returns landmarks and places at depth 1 in each of `num` frames."""
+    rows = rows_by(views.frame, num)
+    return [(views.landmark[of], views.xy[of]) for of in rows]

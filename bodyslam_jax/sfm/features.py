@@ -10,7 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.sfm.multiview import essential_matrix
 
+_MAX_RATIO = 0.8
+"""Largest ratio of the distances to the nearest and to the second descriptor (Lowe,
+IJCV 2004)."""
 _MISSING_BRISK_TEXT = (
     f"OpenCV {cv2.__version__} has no BRISK: install opencv-python-headless<5 or "
     "opencv-contrib-python-headless."
@@ -98,17 +102,13 @@ def epipolar_inliers(
     """
     if len(xy_a) < 12:
         return np.ones(len(xy_a), dtype=bool)
-    _, inlier = cv2.findEssentialMat(
-        xy_a, xy_b, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold, 500
-    )
+    _, inlier = essential_matrix(xy_a, xy_b, threshold)
     if inlier is None:
         return np.ones(len(xy_a), dtype=bool)
     return inlier.ravel() > 0
 
 
-def match(
-    a: UInt8[np.ndarray, "n d"], b: UInt8[np.ndarray, "m d"], *, ratio: float = 0.8
-) -> np.ndarray:
+def match(a: UInt8[np.ndarray, "n d"], b: UInt8[np.ndarray, "m d"]) -> np.ndarray:
     """Returns pairs (k, 2) of mutually nearest descriptors that pass the ratio test."""
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), dtype=np.int64)
@@ -118,7 +118,7 @@ def match(
     found = [
         (first.queryIdx, first.trainIdx)
         for first, second in forward
-        if first.distance < min(ratio * second.distance, 110)
+        if first.distance < min(_MAX_RATIO * second.distance, 110)
         and backward[first.trainIdx] == first.queryIdx
     ]
     return np.asarray(found, dtype=np.int64).reshape(-1, 2)

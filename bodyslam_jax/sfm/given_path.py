@@ -6,7 +6,6 @@ projects within a threshold is the path's *fit*. It is compared with that of a c
 path given the noise of the tracks and of such paths.
 """
 
-import copy
 import dataclasses
 
 import numpy as np
@@ -14,9 +13,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import binom
 
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
-from bodyslam_jax.sfm.bundle import Views
-from bodyslam_jax.sfm.camera_motion import choose_keyframes
-from bodyslam_jax.sfm.multiview import relative_pose
+from bodyslam_jax.sfm.bundle import Views, rows_by
+from bodyslam_jax.sfm.camera_motion import KEYFRAME_MOTION_SHARE, choose_keyframes
+from bodyslam_jax.sfm.multiview import epipolar_distance, relative_pose
 from bodyslam_jax.types import Intrinsics, Tracks
 
 MIN_TESTED_OBSERVATIONS = 200
@@ -36,6 +35,11 @@ two-dimensional errors of a correct path are smaller."""
 _MAX_NOISE_RATIO = 2.0
 """Largest noise of an accepted path, as a multiple of that of a correct path and of the
 tracks together."""
+MIN_EXPECTED_SHARE = 0.95
+"""Least share of the expected fit at which a reading of poses or times is right, and
+no other is tried."""
+_MIN_SHARED_POINTS = 12
+"""Least number of points that two keyframes share."""
 _MAX_TRACKS, _VIEWS_PER_TRACK = 400, 8
 _MIN_BLOCK_FRAMES, _MAX_BLOCKS = 10, 20
 """Least length of a block of time, within which errors are correlated, and
@@ -94,7 +98,6 @@ class PathTest:
     def __init__(self, tracks: Tracks, intrinsics: Intrinsics, num_frames: int):
         K, distortion = as_opencv(intrinsics.params)
         self.focal = float(np.sqrt(K[0, 0] * K[1, 1]))
-        self.num_frames = num_frames
         views = Views(tracks.frame, tracks.landmark, rays(tracks.uv, K, distortion))
         longer = max(intrinsics.width, intrinsics.height)
         path_noise = _PATH_NOISE * longer
@@ -105,31 +108,11 @@ class PathTest:
         self.threshold = _THRESHOLD_SIGMAS * self.noise
         self.expected = share * _within(_THRESHOLD_SIGMAS)
         self.required = share * _within(_THRESHOLD_SIGMAS / _MAX_NOISE_RATIO)
-        self.views = views
-        self._take(views, max(num_frames / _MAX_BLOCKS, float(_MIN_BLOCK_FRAMES)))
-
-    def _take(self, views: Views, block_frames: float) -> None:
-        """Draws a new sample of tracks from these views."""
-        self.frame, self.xy, self.used = _sample(views, self.num_frames)
+        self.frame, self.xy, self.used = _sample(views, num_frames)
         count = np.maximum(self.used.sum(1), 1)
         middle = np.where(self.used, self.frame, 0).sum(1) / count
-        self.block_frames = block_frames
+        block_frames = max(num_frames / _MAX_BLOCKS, float(_MIN_BLOCK_FRAMES))
         self.block = (middle / block_frames).astype(int)
-
-    def in_pieces(self, span: int) -> "PathTest":
-        """Returns the test with tracks cut into pieces within intervals of `span`
-        frames, each of which is a block."""
-        views, cut = self.views, copy.copy(self)
-        piece = views.landmark * (self.num_frames // span + 1) + views.frame // span
-        cut._take(Views(views.frame, piece, views.xy), float(span))
-        return cut
-
-    def around(self, first: float, last: float) -> "PathTest":
-        """Returns the test with a denser sample, of tracks within some frames only."""
-        within = (self.views.frame >= first) & (self.views.frame <= last)
-        part = copy.copy(self)
-        part._take(self.views[np.flatnonzero(within)], self.block_frames)
-        return part
 
     def errors(
         self, T_WC: Float[np.ndarray, "t 4 4"], known: Bool[np.ndarray, " t"]
@@ -219,7 +202,7 @@ def what_would_fit(
     }
     for name, poses in readings.items():
         fit = test.fit(poses, known)
-        if fit.is_tested and fit.share >= 0.95 * fit.expected:
+        if fit.is_tested and fit.share >= MIN_EXPECTED_SHARE * fit.expected:
             return f"{100 * fit.share:.0f} % fit it {name}"
     return None
 
@@ -243,15 +226,15 @@ def _static_share(
     if not len(views.frame):
         return 1.0, _TRACK_NOISE_PX
     first, last = int(views.frame.min()), int(views.frame.max())
-    keyframes = choose_keyframes(views, first, last, 0.03 * longer / focal, 12)
-    order = np.argsort(views.frame, kind="stable")
-    frame = views.frame[order]
-    of = lambda k: order[slice(*np.searchsorted(frame, [k, k + 1]))]
+    keyframes = choose_keyframes(
+        views, first, last, KEYFRAME_MOTION_SHARE * longer / focal, _MIN_SHARED_POINTS
+    )
+    of_frame = rows_by(views.frame, last + 1)
     pairs = list(zip(keyframes[:-1], keyframes[1:], strict=True))
     chosen = np.unique(np.linspace(0, len(pairs) - 1, 12).astype(int)) if pairs else []
     shares, noises = [], []
     for i in chosen:
-        one, other = of(pairs[i][0]), of(pairs[i][1])
+        one, other = of_frame[pairs[i][0]], of_frame[pairs[i][1]]
         _, a, b = np.intersect1d(
             views.landmark[one], views.landmark[other], return_indices=True
         )
@@ -261,7 +244,7 @@ def _static_share(
         pose = relative_pose(*xy, 1 / focal)
         if pose is None:
             continue
-        away = _sampson(*xy, pose[0], pose[1]) * focal
+        away = epipolar_distance(pose[0], pose[1], *xy) * focal
         good = away < threshold
         shares.append(good.mean())
         # 0.6745 is the median absolute value of a standard normal error.
@@ -269,18 +252,6 @@ def _static_share(
     if not shares:
         return 1.0, _TRACK_NOISE_PX
     return float(np.median(shares)), float(np.median(noises))
-
-
-def _sampson(xy_a, xy_b, R: np.ndarray, t: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Returns the distance of pairs of points from the epipolar geometry of R_BA and t,
-    at depth 1, as an error of each of the two points."""
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    E = cross @ R
-    one = np.ones((len(xy_a), 1))
-    a, b = np.hstack([xy_a, one]), np.hstack([xy_b, one])
-    Ea, Etb = a @ E.T, b @ E
-    size = np.sqrt((Ea[:, :2] ** 2).sum(1) + (Etb[:, :2] ** 2).sum(1))
-    return np.abs((b * Ea).sum(1)) / np.maximum(size, 1e-12)
 
 
 def _sample(

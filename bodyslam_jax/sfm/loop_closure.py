@@ -10,11 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.geometry.triangulation import triangulate
-from bodyslam_jax.sfm.bundle import (
-    Scene,
-    Views,
-    errors,
-)
+from bodyslam_jax.sfm.bundle import Scene, Views, errors, rows_by
 from bodyslam_jax.sfm.relocalise import Pose, near, relocate, with_moved
 
 _MIN_VIEWS, _MAX_VIEWS = 2, 8
@@ -25,6 +21,8 @@ _MAX_DRIFT = 10.0
 _MAX_CANDIDATE_ERROR = 2.0
 """Largest error, in thresholds, of a candidate landmark: those with little parallax
 have inaccurate positions."""
+_MAX_ERROR = 3.0
+"""Error, in thresholds, beyond which all errors count alike in a mean."""
 _MAX_JOINT_ERROR = 0.7
 """Largest mean error, in thresholds, of a point that explains two tracks."""
 _MIN_RIVAL_RATIO = 1.5
@@ -41,11 +39,7 @@ class Revisits:
         self.members: dict[int, list[int]] = {}
         """Tracks of each landmark that has more than one, its own number first."""
         self.refused: set[tuple[int, int]] = set()
-        order = np.argsort(self.track, kind="stable")
-        bounds = np.searchsorted(self.track[order], np.arange(num_tracks + 1))
-        self._of_track = [
-            order[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True)
-        ]
+        self._of_track = rows_by(self.track, num_tracks)
 
     def views_of(self, landmark: int) -> Int[np.ndarray, " m"]:
         """Returns all observations of a landmark, whatever tracks they belong to."""
@@ -119,7 +113,7 @@ class Revisits:
     ) -> Float[np.ndarray, " p"]:
         """Returns the mean reprojection error of the point triangulated from both of a
         pair, for the one of the two that it fits worse; in thresholds, each error
-        clipped at 3."""
+        clipped."""
         if not pairs:
             return np.zeros(0)
         parts = [self._some_views(i, registered) for pair in pairs for i in pair]
@@ -137,7 +131,7 @@ class Revisits:
             threshold / 2,
         )
         error = errors(Scene(both.R_CW, both.centre, points), views) / threshold
-        total = np.bincount(part, np.minimum(error, 3.0), len(parts))
+        total = np.bincount(part, np.minimum(error, _MAX_ERROR), len(parts))
         mean = total / np.bincount(part, minlength=len(parts))
         return mean.reshape(-1, 2).max(axis=1)
 
@@ -185,7 +179,7 @@ class Revisits:
         for landmark, tracks in list(self.members.items()):
             for track in tracks[1:]:
                 rows = self._of_track[track]
-                found = np.minimum(error[rows], 3.0)
+                found = np.minimum(error[rows], _MAX_ERROR)
                 found = found[~np.isnan(found)]
                 if len(found) and found.mean() > _MAX_JOINT_ERROR:
                     tracks.remove(track)

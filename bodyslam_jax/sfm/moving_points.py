@@ -8,7 +8,9 @@ import numpy as np
 
 from bodyslam_jax.geometry.triangulation import unit_rays
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
-from bodyslam_jax.sfm.burnt_in import noise_of, sampson
+from bodyslam_jax.sfm.bundle import rows_by
+from bodyslam_jax.sfm.burnt_in import noise_of
+from bodyslam_jax.sfm.multiview import epipolar_distance
 from bodyslam_jax.sfm.sfm import Reconstruction
 from bodyslam_jax.types import Intrinsics, Tracks
 
@@ -40,15 +42,14 @@ def second_motion_warning(
     focal = float(np.sqrt(K[0, 0] * K[1, 1]))
     limit = max(_MIN_DISTANCE_PX, _MIN_DISTANCE_SIGMAS * noise_of(tracks)) / focal
     num_frames = len(found.T_WC)
-    order = np.argsort(tracks.frame, kind="stable")
-    bounds = np.searchsorted(tracks.frame[order], np.arange(num_frames + 1))
+    of_frame = rows_by(tracks.frame, num_frames)
     total, together = 0, 0
     step = max(2, -(-num_frames // _MAX_PAIRS))
     for a in range(0, num_frames - _GAP_FRAMES, step):
         b = a + _GAP_FRAMES
         if not (found.registered[a] and found.registered[b]):
             continue
-        at_a, at_b = (order[bounds[k] : bounds[k + 1]] for k in (a, b))
+        at_a, at_b = of_frame[a], of_frame[b]
         ids = tracks.landmark[at_a], tracks.landmark[at_b]
         _, i, j = np.intersect1d(*ids, return_indices=True)
         if len(i) < _MIN_POINTS:
@@ -79,9 +80,7 @@ def _distance(
     length = np.linalg.norm(t)
     if found.kind != "moving" or length < 1e-9:
         return plain
-    x, y, z = t / length
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.minimum(sampson(cross @ R, before, after), plain)
+    return np.minimum(epipolar_distance(R, t, before, after), plain)
 
 
 def _together(at: np.ndarray, step: np.ndarray) -> int:

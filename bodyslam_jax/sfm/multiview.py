@@ -7,6 +7,26 @@ from jaxtyping import Bool, Float
 from bodyslam_jax.geometry import so3_numpy as so3
 
 
+def essential_matrix(
+    xy_a: Float[np.ndarray, "n 2"],
+    xy_b: Float[np.ndarray, "n 2"],
+    threshold: float,
+    *,
+    chance: float = 1e-3,
+    most: int = 500,
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Returns the essential matrix by five-point RANSAC (MAGSAC), and which pairs are
+    inliers (n, 1).
+
+    Args:
+        chance: probability of no sample without outliers.
+        most: number of samples at most.
+    """
+    how = (cv2.USAC_MAGSAC, 1 - chance, threshold, most)
+    E, inlier = cv2.findEssentialMat(xy_a, xy_b, np.eye(3), *how)
+    return E, inlier
+
+
 def relative_pose(
     xy_a: Float[np.ndarray, "n 2"], xy_b: Float[np.ndarray, "n 2"], threshold: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
@@ -15,9 +35,7 @@ def relative_pose(
 
     It is five-point RANSAC, and the decomposition with most points in front.
     """
-    E, inlier = cv2.findEssentialMat(
-        xy_a, xy_b, np.eye(3), cv2.USAC_MAGSAC, 0.9999, threshold, 2000
-    )
+    E, inlier = essential_matrix(xy_a, xy_b, threshold, chance=1e-4, most=2000)
     if E is None or E.shape != (3, 3) or inlier is None:
         return None
     _, R, t, good, _ = cv2.recoverPose(
@@ -157,3 +175,29 @@ def refine_pose(
         if np.abs(step[:3]).max() < 1e-8:
             break
     return R, centre, _fits(R, centre, points, xy, 3 * threshold)
+
+
+def epipolar_distance(
+    R: Float[np.ndarray, "3 3"],
+    t: Float[np.ndarray, " 3"],
+    xy_a: Float[np.ndarray, "n 2"],
+    xy_b: Float[np.ndarray, "n 2"],
+) -> Float[np.ndarray, " n"]:
+    """Returns `sampson` of the relative pose R_BA and t."""
+    x, y, z = t
+    return sampson(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R, xy_a, xy_b)
+
+
+def sampson(
+    E: Float[np.ndarray, "3 3"],
+    xy_a: Float[np.ndarray, "n 2"],
+    xy_b: Float[np.ndarray, "n 2"],
+) -> Float[np.ndarray, " n"]:
+    """Returns the first-order distance of each pair from the epipolar constraint, at
+    depth 1."""
+    one = np.ones((len(xy_a), 1))
+    a, b = np.concatenate([xy_a, one], axis=-1), np.concatenate([xy_b, one], axis=-1)
+    at_b, at_a = a @ E.T, b @ E
+    value = np.einsum("ni,ni->n", b, at_b)
+    norm = np.sqrt((at_b[:, :2] ** 2).sum(axis=-1) + (at_a[:, :2] ** 2).sum(axis=-1))
+    return np.abs(value) / np.maximum(norm, 1e-12)

@@ -1,14 +1,13 @@
 """A growing map: triangulation, inliers, bundle adjustment, joined tracks."""
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Int
 
 from bodyslam_jax.config import Structure
 from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
-from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
+from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors, rows_by
 from bodyslam_jax.sfm.loop_closure import Revisits
 
 _OUTLIER_ERROR_PX = 2.0
@@ -34,8 +33,8 @@ _MAX_ROUNDS, _MAX_SETTLED_SHARE = 6, 0.01
 """Largest number of rounds of joining and separating tracks, and the share of
 observations that change their landmark below which the rounds end."""
 
-Refine = Callable[[Scene, Views, Bool[np.ndarray, " t"]], None]
-"""Adjusts the free cameras and all points of `views` in place, as `bundle.adjust`."""
+_TOLERANCE = 1e-3
+"""Relative decrease of the cost that ends an adjustment while the map grows."""
 
 
 @dataclasses.dataclass
@@ -61,7 +60,6 @@ class Mapper:
         num_landmarks: int,
         focal: float,
         config: Structure,
-        refine: Refine | None = None,
     ):
         self.views = Views(views.frame, views.landmark.copy(), views.xy)
         self.config = config
@@ -71,15 +69,7 @@ class Mapper:
         self.pixel: float = 1 / focal
         self.threshold: float = _OUTLIER_ERROR_PX / focal
         self.min_angle = np.radians(_MIN_ANGLE_DEG)
-        self.refine = refine or self._adjust
-        order = np.argsort(views.frame, kind="stable")
-        bounds = np.searchsorted(views.frame[order], np.arange(num_frames + 1))
-        self.of_frame = [
-            order[a:b] for a, b in zip(bounds[:-1], bounds[1:], strict=True)
-        ]
-
-    def _adjust(self, scene: Scene, views: Views, free: np.ndarray) -> None:
-        adjust(scene, views, free, loss=self.pixel, iterations=10, tolerance=1e-3)
+        self.of_frame = rows_by(views.frame, num_frames)
 
     def _join(self, grown: PartialMap, k: int) -> None:
         """Joins points of frame `k` with points of the map that they revisit."""
@@ -121,7 +111,7 @@ class Mapper:
                 self.views[use],
                 self._free(grown),
                 loss=loss * self.pixel,
-                tolerance=1e-3,
+                tolerance=_TOLERANCE,
             )
         self._mark(grown)
 
@@ -241,5 +231,6 @@ class Mapper:
             touched[self.views.landmark[use[free[self.views.frame[use]]]]] = True
             use = use[touched[self.views.landmark[use]]]
         if len(use):
-            self.refine(grown.scene, self.views[use], free)
+            views = self.views[use]
+            adjust(grown.scene, views, free, loss=self.pixel, tolerance=_TOLERANCE)
         self._mark(grown)

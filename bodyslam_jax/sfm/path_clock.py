@@ -2,8 +2,8 @@
 
 Where the times of a path are not those of the video, each reading of them (`PathClock`)
 is tried with its best offset (`path_offset`), and the reading that fits best is taken;
-one that fits no better than another is rejected. Lost frames are steps of the offset,
-and a guessed focal length is corrected with the clock.
+one that fits no better than another is rejected. A guessed focal length is corrected
+with the clock.
 """
 
 import dataclasses
@@ -14,35 +14,28 @@ from jaxtyping import Float
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.camera.path import at_times, usual_step
 from bodyslam_jax.sfm.given_path import (
+    MIN_EXPECTED_SHARE,
     MIN_TESTED_OBSERVATIONS,
     MIN_VIEWS,
     PathTest,
     is_worse,
-    mean_cost,
 )
 from bodyslam_jax.sfm.path_offset import (
-    MAX_OFFSETS,
     MAX_WHOLE_RATE_ERROR,
     SIGNIFICANCE_SIGMAS,
     ClockOffset,
     OffsetSearch,
     best_offset,
+    enough_observations,
 )
 from bodyslam_jax.types import CameraPath, Intrinsics, PathClock, Tracks
 
 _LOCAL_FRAMES = 15
 """Number of frames before and after the given time within which other offsets of a path
 on the video's own clock are tried."""
-_MIN_EXPECTED_SHARE = 0.95
-"""Least share of the expected fit at which no other reading of the times is tried."""
 _MAX_ASSUMED_RATE_ERROR = 0.05
 """Largest relative difference of rates at which a tracker may have assumed another
 frame rate than the video's without any part of the path showing it."""
-_LOST_PENALTY = 0.02
-"""Least decrease of the cost by a step of the offset, as a share of it."""
-_PIECE_FRAMES = 10
-"""Length, in frames, of the pieces of tracks between which steps of the offset are
-sought."""
 _FOCAL_FACTORS = (0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5)
 """Factors on a guessed focal length with which a path is tried: fields of view from 31
 to 70 degrees around the guess of 45 degrees."""
@@ -67,8 +60,7 @@ def place_in_time(
     """Converts the poses of a path to the clock of the video, by the tracks.
 
     A path on the video's own clock is kept, unless another offset fits significantly
-    better. For any other path the offset, and lost frames in between, are estimated
-    from the tracks.
+    better. For any other path the offset is estimated from the tracks.
 
     Args:
         timestamps: times of the frames, s.
@@ -110,7 +102,8 @@ def place_in_time(
             f"explains the images: {100 * fit.share:.0f} % of the points fit at best, "
             f"with its first pose at {found.times[0]:.2f} s, expected "
             f"{100 * fit.doubtful:.0f} % or more: poses of another video, from world "
-            "to camera, with other axes, or another focal length?"
+            "to camera, with other axes or another focal length, or poses left out "
+            "and not numbered?"
         )
     if found.is_given:
         return Placed(path, intrinsics, tuple(warnings))
@@ -143,9 +136,6 @@ def place_in_time(
         before = search.test.fit(path.T_WC, path.known)
         text += f" and not at {given.times[0]:.3f} s, where {100 * before.share:.0f} %"
     warnings.append(text + ".")
-    if found.lost:
-        where = ", ".join(f"{k} before {s:.2f} s" for s, k in found.lost[:4])
-        warnings.append(f"camera path: frames without a pose were lost: {where}.")
     said = given.is_videos and placed.known.sum() == path.known.sum()
     if not placed.known.all() and not said:
         count = f"{int(placed.known.sum())} of {len(timestamps)}"
@@ -187,8 +177,6 @@ def _best_clock(
             *(best_offset(search, c, search.offsets(c.times)) for c in others),
         ]
         best = _best_of(search, found)
-    if best is not None and not (best.is_given and _fits_as_expected(search, best)):
-        best = _best_of(search, [best, _with_lost_frames(search, best)])
     if kept is not None and best is not None and not best.is_given:
         # The given times of a path are kept, unless others convince by themselves.
         fit = search.test.fit(*at_times(best.times, search.poses, search.timestamps))
@@ -213,86 +201,7 @@ def _best_of(
 def _fits_as_expected(search: OffsetSearch, found: ClockOffset) -> bool:
     """Returns True if as many points fit as with a correct path."""
     fit = search.test.fit(*at_times(found.times, search.poses, search.timestamps))
-    return fit.is_tested and fit.share >= _MIN_EXPECTED_SHARE * fit.expected
-
-
-def _with_lost_frames(search: OffsetSearch, found: ClockOffset) -> ClockOffset | None:
-    """Returns the offset with a step at each run of frames that have no pose and were
-    not numbered; `None` if there is no such step.
-
-    Each block of time prefers an offset, which is tested by pieces of tracks within it,
-    as no offset explains a track across a step. The increasing series of offsets of
-    least cost is found by dynamic programming, and then the frame of each step.
-    """
-    period, start = search.period, search.timestamps[0]
-    # A path with lost frames was made from this video: it begins and ends within it.
-    first = np.floor((found.times[0] - start) / period + 1e-3)
-    times = found.times - first * period
-    missing = search.timestamps[-1] - times[-1]
-    most = min(int(round(missing / period)), MAX_OFFSETS)
-    if most < 1:
-        return None
-    steps = np.arange(most + 1)
-    pieces = search.test.in_pieces(_PIECE_FRAMES)
-    short = OffsetSearch(pieces, search.poses, search.timestamps)
-    profile = short.profile(times, steps * period)
-    num = profile[..., 1].max(0)
-    mean = profile[..., 0] / np.maximum(profile[..., 1], 1)
-    unseen = profile[..., 1] < 0.5 * num
-    # Blocks in which an offset has no poses get the median cost: no preference.
-    seen = np.where(unseen, np.nan, mean)
-    usual = np.array([np.nanmedian(c) if np.isfinite(c).any() else 0.0 for c in seen.T])
-    cost = np.where(unseen, usual, mean) * num
-    penalty = _LOST_PENALTY * np.median(cost, axis=0).sum() + 1e-9
-    total, back = cost[:, 0], []
-    for b in range(1, cost.shape[1]):
-        # Either a step from the best smaller offset, with a penalty, or none.
-        best = np.minimum.accumulate(total)
-        at = np.maximum.accumulate(np.where(total <= best, np.arange(len(total)), 0))
-        jumps = best + penalty < total
-        back.append(np.where(jumps, at, np.arange(len(total))))
-        total = np.where(jumps, best + penalty, total) + cost[:, b]
-    chosen = [int(np.argmin(total))]
-    for before in reversed(back):
-        chosen.append(int(before[chosen[-1]]))
-    offset = steps[np.array(chosen[::-1])]
-    ends = np.flatnonzero(np.diff(offset))
-    if not len(ends):
-        return None
-    times = times + offset[0] * period
-    # The pose at which each step lies, and its number of frames: by whole tracks.
-    counts = offset[ends + 1] - offset[ends]
-    before = np.cumsum(counts) - counts
-    at = (ends + 1) * _PIECE_FRAMES - offset[0] - before
-    at = np.clip(at, 1, len(times) - 1)
-
-    def stepped(at: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, " n"]:
-        after = np.arange(len(times))[:, None] >= at
-        return times + period * (after * counts).sum(1)
-
-    # First the pose, then also the number of frames; last by all views near the step.
-    rounds = ((2 * _PIECE_FRAMES, 0), (3, 2), (3, 1))
-    for turn, (reach, change) in enumerate(rounds):
-        for k in range(len(at)):
-            near = search
-            if turn == len(rounds) - 1:
-                middle = (stepped(at, counts)[at[k]] - start) / period
-                away = _PIECE_FRAMES + counts[k]
-                test = search.test.around(middle - away, middle + _PIECE_FRAMES)
-                near = OffsetSearch(test, search.poses, search.timestamps)
-            one = np.arange(len(at)) == k
-            tries = [
-                (np.clip(at + move * one, 1, len(times) - 1), counts + more * one)
-                for more in range(-min(change, counts[k] - 1), change + 1)
-                for move in range(-reach, reach + 1)
-            ]
-            costs = [
-                mean_cost(near.costs(stepped(*pair), bridged=False)) for pair in tries
-            ]
-            at, counts = tries[int(np.argmin(costs))]
-    moved = stepped(at, counts)
-    lost = tuple((float(moved[n]), int(counts[at == n].sum())) for n in np.unique(at))
-    return dataclasses.replace(found, times=moved, is_given=False, lost=lost)
+    return fit.is_tested and fit.share >= MIN_EXPECTED_SHARE * fit.expected
 
 
 def _with_best_focal(
@@ -312,7 +221,7 @@ def _with_best_focal(
         profile = other.profile(clock.times, offsets)
         count = profile[..., 1].sum(1)
         mean = profile[..., 0].sum(1) / np.maximum(count, 1)
-        mean[count < max(MIN_TESTED_OBSERVATIONS, 0.3 * count.max())] = np.inf
+        mean[count < enough_observations(count)] = np.inf
         tries.append((float(mean.min()), abs(factor - 1), other, camera))
     best = min(tries, key=lambda one: one[:2])
     same = next(one for one in tries if one[1] == 0.0)

@@ -52,8 +52,6 @@ class ClockOffset:
     """Standard deviation of the offset, s."""
     is_given: bool = False
     """True if the times are those in the file."""
-    lost: tuple[tuple[float, int], ...] = ()
-    """Times (s) before which poses are missing, each with the number of frames."""
 
 
 class OffsetSearch:
@@ -73,15 +71,9 @@ class OffsetSearch:
         T_WC, known = at_times(times, self.poses, self.timestamps)
         return dataclasses.replace(path, T_WC=T_WC, known=known, poses=None, clocks=())
 
-    def costs(
-        self, times: Float[np.ndarray, " n"], *, bridged: bool = True
-    ) -> Float[np.ndarray, "b 2"]:
-        """Returns `PathTest.cost` with the poses at `times`; if not `bridged`, without
-        frames whose neighbouring poses are missing."""
+    def costs(self, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, "b 2"]:
+        """Returns `PathTest.cost` with the poses at `times`."""
         T_WC, known = at_times(times, self.poses, self.timestamps)
-        if not bridged:
-            away = np.abs(self.timestamps[:, None] - times).min(1)
-            known = known & (away < 0.75 * self.period)
         return self.test.cost(self.test.errors(T_WC, known))
 
     def offsets(self, times: Float[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
@@ -186,13 +178,19 @@ class OffsetSearch:
         )
 
 
+def enough_observations(count: Float[np.ndarray, " d"]) -> float:
+    """Returns the number of tested observations, of `count` at each offset, from which
+    offsets are compared: with few, by chance any fits."""
+    return max(MIN_TESTED_OBSERVATIONS, 0.3 * float(count.max()))
+
+
 def best_offset(
     search: OffsetSearch, clock: PathClock, offsets: Float[np.ndarray, " d"]
 ) -> ClockOffset | None:
     """Returns the best of the offsets (s) of a clock, refined; `None` without one."""
     profile = search.profile(clock.times, offsets)
     count = profile[..., 1].sum(1)
-    enough = count >= max(MIN_TESTED_OBSERVATIONS, 0.3 * count.max())
+    enough = count >= enough_observations(count)
     if not enough.any():
         return None
     mean = np.where(enough, profile[..., 0].sum(1) / np.maximum(count, 1), np.inf)

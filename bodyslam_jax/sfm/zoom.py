@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.triangulation import unit_rays
-from bodyslam_jax.sfm.bundle import Views
+from bodyslam_jax.sfm.bundle import Views, rows_by
 from bodyslam_jax.types import Tracks
 
 MIN_LOG_ZOOM = 0.04
@@ -37,9 +37,7 @@ def turning_zoom(
     Args:
         limit: largest median error, at depth 1, of a correct model.
     """
-    order = np.argsort(views.frame, kind="stable")
-    bounds = np.searchsorted(views.frame[order], np.arange(num_frames + 1))
-    of_frame = [order[i:j] for i, j in zip(bounds[:-1], bounds[1:], strict=True)]
+    of_frame = rows_by(views.frame, num_frames)
 
     def pair(a: int, b: int, before: float) -> tuple[float, float, float] | None:
         """Returns `_turn_and_scale` of frames a and b, both

@@ -35,6 +35,7 @@ person."""
 _MAX_OVERLAP_SHARE = 0.15
 """Share of the frames that two rows of one person may have in common."""
 _MIN_COINCIDENT_SHARE = 0.8
+"""Share of the frames that two rows share in which they must be that near."""
 _MIN_SHARED_FRAMES = 3
 _MAX_GAP_FRAMES = 5
 """Gap, in frames, up to which a person without keypoints is recognised by position."""
@@ -54,10 +55,7 @@ def settle_identities(sequence: Sequence, body: BodyModel, warn: Warn) -> Sequen
     apart = distances(people.keypoints, projected)
     persons = _pair(apart, present)
     persons = _joined(persons, apart, (people.keypoints, projected), present)
-    if present[0].any():
-        persons = _attached(persons, apart, projected, present[1])
-    else:
-        persons = _joined_by_place(persons, projected, present[1], warn)
+    persons = _attached(persons, apart, projected, present[1])
     _say_who_is_one(persons, present, warn)
     persons = _worth_keeping(persons, sequence, projected, apart, present, warn)
     return gathered(sequence, persons, apart)
@@ -181,33 +179,6 @@ def _attached(persons, apart, projected, posed_at) -> list[Person]:
 
 def _frames(posed_at, person: Person) -> np.ndarray:
     return np.flatnonzero(posed_at[list(person.bodies)].any(0))
-
-
-def _joined_by_place(persons, projected, posed_at, warn: Warn) -> list[Person]:
-    """Merges, where there are no keypoints, each body that begins where another has
-    just ended."""
-    middle, radius = centred(projected)
-    ends = lambda p: _frames(posed_at, p)[[0, -1]]
-    done: list[Person] = []
-    for person in sorted(persons, key=lambda p: int(ends(p)[0])):
-        first = int(ends(person)[0])
-        before = [p for p in done if ends(p)[1] < first]
-        earlier = max(before, key=lambda p: int(ends(p)[1]), default=None)
-        if earlier is not None:
-            last = int(ends(earlier)[1])
-            goes_on = _goes_on(
-                middle, radius, (last, earlier.bodies), (first, person.bodies)
-            )
-            if goes_on and first - last <= _MAX_GAP_FRAMES:
-                done.remove(earlier)
-                person = Person((), (*earlier.bodies, *person.bodies))
-            else:
-                warn(
-                    f"bodies that begin in frame {first} may be of the person who was "
-                    f"last there in frame {last}."
-                )
-        done.append(person)
-    return done
 
 
 def _goes_on(middle, radius, end, start) -> bool:

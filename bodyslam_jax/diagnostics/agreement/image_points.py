@@ -18,6 +18,7 @@ POINTS = slice(1, 15)
 """The keypoints of BODY_25 that are compared."""
 NECK, R_SHOULDER, L_SHOULDER, MID_HIP, R_HIP, L_HIP = 0, 1, 4, 7, 8, 11
 ANKLES = (10, 13)
+"""Indices among the 14 points."""
 MIRRORED_POINTS = np.array([0, 4, 5, 6, 1, 2, 3, 7, 11, 12, 13, 8, 9, 10])
 """Index of each point's counterpart on the other side of the body."""
 
@@ -31,6 +32,8 @@ _MAX_DISTANCE_SIZES = 3.0
 """Distances are clipped to this, in sizes of a person."""
 _MIN_CONFIDENCE_RATIO = 0.25
 """Least confidence of a keypoint, relative to the 90 % quantile of the person's."""
+_MIN_DEPTH_M = 0.05
+"""Depth, m, below which a point is behind the camera: inside its housing."""
 _MIN_SIZE_PX = 10.0
 """Lower bound on sizes in denominators, px."""
 
@@ -68,6 +71,7 @@ def people_of(sequence: Sequence, body: BodyModel) -> People:
 def sure_points(keypoints: Keypoints) -> Float[np.ndarray, "h t 14 2"]:
     """Returns the keypoints of high confidence, px; NaN for others."""
     confidence = keypoints.confidence[..., POINTS]
+    # The 90 % quantile, as `_MIN_CONFIDENCE_RATIO` says.
     best = [np.quantile(c[c > 0], 0.9) if (c > 0).any() else 1.0 for c in confidence]
     least = _MIN_CONFIDENCE_RATIO * np.reshape(best, (-1, 1, 1))
     sure = (confidence > 0) & (confidence >= least)
@@ -94,10 +98,10 @@ def project(
     Points behind the camera get a pixel far away; missing points stay NaN.
     """
     fx, fy, cx, cy = camera.params[:4]
-    missing, front = np.isnan(p_C[..., 2]), p_C[..., 2] > 0.05
+    missing, front = np.isnan(p_C[..., 2]), p_C[..., 2] > _MIN_DEPTH_M
     z = np.where(front, p_C[..., 2], 1.0)
     x, y = p_C[..., 0] / z, p_C[..., 1] / z
-    if len(camera.params) == 8:
+    if len(camera.params) > 4:
         k1, k2, p1, p2 = camera.params[4:]
         corner = (camera.width / fx) ** 2 + (camera.height / fy) ** 2
         r2 = x * x + y * y
