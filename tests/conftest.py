@@ -8,8 +8,10 @@ as to compile. Compiled programs are dropped at the end of each file, and where 
 process exceeds `_MEMORY`.
 """
 
+import ctypes
 import gc
 import os
+import platform
 import sys
 from pathlib import Path
 
@@ -25,7 +27,7 @@ if jaxlib.version.__version__.startswith("0.10."):
     flags = ("--xla_cpu_use_fusion_emitters=false", os.environ.get("XLA_FLAGS", ""))
     os.environ["XLA_FLAGS"] = " ".join(flags)
 
-_MEMORY = 1.3e9
+_MEMORY = 1.5e9
 """Resident memory of a process, bytes, from which compiled programs are dropped after
 a test: two processes stay below 4 GB."""
 
@@ -40,6 +42,8 @@ _LONGEST = (
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_disable_most_optimizations", True)
+# In child processes too, which then share machine code with the tests' own.
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
     folder = Path(__file__).parents[1] / ".pytest_cache" / "jax"
@@ -56,10 +60,13 @@ def pytest_collection_modifyitems(items):
 
 
 def drop_programs() -> None:
-    """Frees compiled programs and what was traced for them."""
+    """Frees compiled programs and what was traced for them, and gives their memory
+    back to the system: it would seem used after the next test, too."""
     eqx.clear_caches()
     jax.clear_caches()
     gc.collect()
+    if platform.libc_ver()[0] == "glibc":
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -138,6 +138,7 @@ def test_values_of_a_share_are_read_up_to_what_is_complete(tmp_path):
     assert read_values(file, len(whole))[0] == [(1, "b")]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not WITH_SLURM, reason="needs submitit")
 def test_slurm_without_sbatch_is_refused_in_a_line(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -157,6 +158,7 @@ print("Submitted batch job 77")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not WITH_SLURM, reason="needs submitit")
 def test_the_script_for_sbatch_is_a_job_array_with_what_was_asked_for(
     tmp_path, monkeypatch

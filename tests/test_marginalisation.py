@@ -158,9 +158,8 @@ def test_a_linear_problem_has_the_solution_of_the_whole(people):
 CASES = [
     pytest.param({"known": True, "steady": True, "length": 4}, id="cameras"),
     pytest.param({"landmarks": 60, "length": 12}, id="long tracks"),
-    pytest.param({"people": 1}, id="person", marks=pytest.mark.slow),
     pytest.param(
-        {"people": 2, "extras": True, "free_intrinsics": True, "some_held": True},
+        {"people": 1, "extras": True, "free_intrinsics": True, "some_held": True},
         id="all factors",
         marks=pytest.mark.slow,
     ),
@@ -252,16 +251,11 @@ def remaining_step(step, state):
     )
 
 
-NONLINEAR = [
-    pytest.param({"landmarks": 120, "length": 6}, 1e-6, id="cameras"),
-    pytest.param({"people": 1, "landmarks": 60}, 1e-5, id="person"),
-]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("options", "same"), NONLINEAR)
-def test_what_is_left_is_solved_where_the_whole_is(options, same):
-    problem, _, state = make(frames=20, **options)
+def test_what_is_left_is_solved_where_the_whole_is():
+    """With a person; cameras alone are in the test of single precision below."""
+    problem, _, state = make(frames=20, people=1, landmarks=60)
+    same = 1e-5
     batch = solution(problem, state)
     # Where both are linearised at the solution, from anywhere near.
     left = marginalise(problem, batch, 10)
@@ -332,10 +326,6 @@ def test_a_simulated_clip_is_solved_in_two_windows_as_it_is_whole():
     away = farthest(left.problem, found, remaining(batch, left, 10))
     assert away["scale"] < 1e-5
     assert max(away["cameras"], away["roots"]) < 1e-4
-    left = marginalise(left.problem, found, 20)
-    found = bs.solve(left.problem, left.state, schedule=well).state
-    assert float(found.scale) == pytest.approx(float(batch.scale), rel=2e-3)
-    assert jnp.abs(found.roots[:, 10:] - batch.roots[:, 20:]).max() < 5e-3
 
 
 def similar(state, turn=(0.4, -0.7, 0.2), shift=(3.0, -1.0, 2.0), ratio=2.5):

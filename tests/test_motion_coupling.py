@@ -102,22 +102,6 @@ def test_first_order_steps_follow_what_is_predicted_anew():
     np.testing.assert_allclose(found.state.poses, moved.poses, atol=1e-6)
 
 
-@pytest.mark.slow
-def test_gradient_by_the_motion_model_is_that_of_solving_again():
-    problem, start = make()
-    exact = (Stage(rtol=1e-15, max_steps=200),)
-    start = solve(problem, start, schedule=exact).state
-
-    def value(gain):
-        there = eqx.tree_at(lambda p: p.motion.model, problem, gain)
-        found = solve(there, start, schedule=exact).state
-        return found.scale + jnp.sum(found.roots[0, :, 2, 3]) + found.shapes[0, 0]
-
-    slope = jax.grad(value)(jnp.asarray(1.0))
-    numeric = (value(jnp.asarray(1.001)) - value(jnp.asarray(0.999))) / 2e-3
-    assert float(slope) == pytest.approx(float(numeric), rel=5e-3)
-
-
 def walk(scale):
     """A simulated walk of two seconds, measured exactly, of which only the person's
     places and postures may move; predicted by the network that ships."""

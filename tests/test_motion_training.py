@@ -411,7 +411,6 @@ from test_motion_data import make_clip
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import MotionTraining
 from bodyslam_jax.motion import train
-jax.config.update("jax_disable_most_optimizations", True)
 small = MotionTraining(past=4, width=(16, 8), epochs=1, segments=8, steps=4)
 model, history = train([make_clip(40)], load_body_model(), small)
 np.savez(sys.argv[1], count=jax.local_device_count(), history=history,

@@ -547,7 +547,7 @@ def test_files_cut_short(tmp_path, name):
         assert not loads_or_refuses(tmp_path / name, content[:end]), end
 
 
-@pytest.mark.parametrize("step", [37, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step", [37, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", small_files())
 def test_flips_of_a_bit(tmp_path, name, step):
     content = small_files()[name]

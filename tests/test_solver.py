@@ -511,7 +511,7 @@ def test_single_precision_serves_people_and_covariances_too():
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            {"frames": 23, "people": 2, "landmarks": 60}, marks=pytest.mark.slow
+            {"frames": 13, "people": 2, "landmarks": 60}, marks=pytest.mark.slow
         ),
         pytest.param(
             {"frames": 43, "people": 1, "landmarks": 60, "length": 40},
@@ -628,14 +628,15 @@ def test_what_is_eliminated_last_serves_every_kind_of_solve(monkeypatch):
     single = solve(half(after), half(start))
     assert float(single.cost) == pytest.approx(float(best.cost), rel=1e-4)
 
-    def place(shift, problem):
+    def place(shift):
         pixels = lambda p: p.factors[0].pixel
-        data = eqx.tree_at(pixels, problem, pixels(problem) + shift)
+        data = eqx.tree_at(pixels, after, pixels(after) + shift)
         return solve(data, start, schedule=TIGHT).state.landmarks[-1, 2]
 
-    shifts = jnp.array([0.0, 0.3])
-    slope = lambda problem: jax.vmap(jax.grad(lambda x: place(x, problem)))(shifts)
-    assert np.allclose(slope(after), slope(before), rtol=1e-6)
+    shifts, size = jnp.array([0.0, 0.3]), 1e-3
+    slopes = jax.vmap(jax.grad(place))(shifts)
+    places = jax.vmap(place)(jnp.concatenate([shifts + size, shifts - size]))
+    assert np.allclose(slopes, (places[:2] - places[2:]) / (2 * size), rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -831,9 +832,12 @@ class Seen(eqx.Module):
 
 
 def stride(model, body, orientation, body_pose, shape, present):
-    """A motion model in one line: the more the legs swing, the longer the step."""
+    """A motion model in one line, of three frames: the more the legs swing, and the
+    larger the person, the longer the step."""
     swing = body_pose[:, 0, 0] - body_pose[:, 1, 0]
+    swing = swing + 0.5 * jnp.roll(swing, 2)
     step = model * jnp.stack([0 * swing, 0.01 * swing, 0.05 + 0.02 * swing], -1)
+    step = step * (1 + 0.05 * shape[0])
     return Seen(step, jnp.zeros_like(step), body_pose)
 
 
@@ -1008,32 +1012,38 @@ def test_derivatives_where_landmarks_or_single_coordinates_are_held():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("people", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_marginal_covariances_are_differentiable(people):
-    problem, _, start = make(people=people, known=True)
+def test_marginal_covariances_are_differentiable():
+    """By standard deviations of keypoints, by those of landmarks, and by the state."""
+    problem, _, start = make(people=1, known=True)
     state = solve(problem, start).state
     spread = marginals(problem, state)
-    kind = g.KeypointReprojection if people else g.Reprojection
-    at = next(i for i, f in enumerate(problem.factors) if isinstance(f, kind))
-    sigma = problem.factors[at].sigma
-    seen = jnp.isfinite(sigma)
-    sigma = jnp.where(seen, sigma, 1.0)
-    way = jnp.asarray(np.random.default_rng(3).standard_normal(sigma.shape))
+    kinds, rng = (g.KeypointReprojection, g.Reprojection), np.random.default_rng(3)
+    sigmas_of = lambda p: [
+        next(f for f in p.factors if isinstance(f, kind)).sigma for kind in kinds
+    ]
+    sigmas = sigmas_of(problem)
+    ways = [jnp.asarray(rng.standard_normal(sigma.shape)) for sigma in sigmas]
     move = state.zero_step()
     move = dataclasses.replace(
         move, cameras=move.cameras.at[3, 3].set(1.0), roots=move.roots + 0.1
     )
 
     def value(by):
-        size = jnp.where(seen, sigma * jnp.exp(by[0] * way), jnp.inf)
-        there = eqx.tree_at(lambda p: p.factors[at].sigma, problem, size)
-        found = marginals(there, state.retract(jax.tree.map(lambda x: by[1] * x, move)))
+        sizes = [
+            jnp.where(
+                jnp.isfinite(sigma),
+                jnp.where(jnp.isfinite(sigma), sigma, 1.0) * jnp.exp(by[k] * way),
+                jnp.inf,
+            )
+            for k, (sigma, way) in enumerate(zip(sigmas, ways, strict=True))
+        ]
+        there = eqx.tree_at(sigmas_of, problem, sizes)
+        found = marginals(there, state.retract(jax.tree.map(lambda x: by[2] * x, move)))
         deviation = jnp.sqrt(jnp.trace(found.cameras[1:], axis1=1, axis2=2))
         return jnp.sum(deviation) + found.scale + jnp.sum(found.shapes)
 
-    slopes = jax.grad(value)(jnp.zeros(2))
-    assert jnp.isfinite(value(jnp.zeros(2)))
+    slopes = jax.grad(value)(jnp.zeros(3))
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(spread))
-    for slope, step in zip(slopes, 1e-5 * jnp.eye(2), strict=True):
+    for slope, step in zip(slopes, 1e-5 * jnp.eye(3), strict=True):
         numeric = float(value(step) - value(-step)) / 2e-5
         assert float(slope) == pytest.approx(numeric, rel=1e-4)

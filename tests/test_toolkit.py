@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 import bodyslam_jax as bs
 from bodyslam_jax import graph
 from bodyslam_jax.graph import Cauchy, Loss
+from bodyslam_jax.solver.compilation import compiled
 
 FRAMES = 40
 
@@ -32,6 +33,17 @@ def built(case):
 @pytest.fixture(scope="module")
 def solution(built):
     return bs.solve(*built)
+
+
+@compiled
+def terms_of(problem, state):
+    """The cost by term, in one program for all tests: one by one its operations take
+    several times as long to compile."""
+    return problem.cost_by_term(state)
+
+
+def cost_of(problem, state):
+    return sum(terms_of(problem, state).values())
 
 
 class CameraPosition(bs.FrameFactor):
@@ -96,7 +108,7 @@ def test_the_top_level_has_the_names_of_the_toolkit():
 def test_a_simulated_case_is_built_and_solved(case, built, solution):
     problem, state = built
     assert solution.status == "converged"
-    assert solution.cost < problem.cost(state)
+    assert solution.cost < cost_of(problem, state)
     # Cameras are held: nothing but the people and the scale has moved.
     np.testing.assert_array_equal(solution.state.cameras, state.cameras)
     assert abs(float(solution.state.scale) / case.map_scale - 1) < 0.2
@@ -122,7 +134,7 @@ def test_weights_are_inverse_variances_by_term(built):
     np.testing.assert_allclose(found["human_motion"], 100.0, rtol=1e-12)
     np.testing.assert_allclose(found["keypoints"], 0.5, rtol=1e-12)
     # The cost of a term is λ times its robust loss, and other terms stay.
-    before, after = (p.cost_by_term(state) for p in (problem, changed))
+    before, after = (terms_of(p, state) for p in (problem, changed))
     for name in ("human_motion", "keypoints"):
         ratio = found[name] / weights[name]
         np.testing.assert_allclose(after[name] / before[name], ratio, rtol=1e-9)
@@ -131,14 +143,14 @@ def test_weights_are_inverse_variances_by_term(built):
 
 def test_a_term_has_one_name_everywhere(built):
     problem, state = built
-    terms = problem.cost_by_term(state)
+    terms = terms_of(problem, state)
     assert problem.names == list(terms)
     assert set(bs.weights(problem)) <= set(terms)
 
 
 def test_names_of_classes_are_understood_and_the_new_one_is_said(built):
     problem, state = built
-    terms = problem.cost_by_term(state)
+    terms = terms_of(problem, state)
     with pytest.warns(DeprecationWarning, match="is called 'human_motion' now"):
         assert terms["HumanMotion"] == terms["human_motion"]
     with pytest.warns(DeprecationWarning, match="is called 'keypoints'"):
@@ -240,18 +252,16 @@ def in_another_unit(problem, state, factor):
 
 def test_the_cost_does_not_depend_on_the_unit_of_the_map(built):
     problem, state = built
-    expected = problem.cost_by_term(state)
-    terms = lambda p, s: p.cost_by_term(s)
-    costs_of = jax.jit(lambda f: terms(*in_another_unit(problem, state, f)))
+    expected = terms_of(problem, state)
     for factor in FACTORS:
-        found = costs_of(factor)
+        found = terms_of(*in_another_unit(problem, state, factor))
         for term, cost in expected.items():
             np.testing.assert_allclose(
                 found[term], cost, rtol=1e-9, atol=1e-20, err_msg=term
             )
     assert {"ground", "landmark_prior"} <= set(expected)
     larger, start = bs.rescaled(problem, state, 2.0)
-    assert larger.cost(start) > problem.cost(state) + 1
+    assert cost_of(larger, start) > sum(expected.values()) + 1
 
 
 @pytest.mark.slow
@@ -264,8 +274,8 @@ def test_a_batch_of_factors_is_a_batch_of_problems(built):
     np.testing.assert_allclose(one.cameras[:, :3, 3], 2 * state.cameras[:, :3, 3])
     np.testing.assert_array_equal(one.roots, state.roots)
     assert one.scale == state.scale
-    costs = jax.vmap(lambda p, s: p.cost(s))(problems, states)
-    np.testing.assert_allclose(costs[1], one_problem.cost(one), rtol=1e-9)
+    costs = jax.jit(jax.vmap(lambda p, s: p.cost(s)))(problems, states)
+    np.testing.assert_allclose(costs[1], cost_of(one_problem, one), rtol=1e-9)
 
 
 def test_a_state_alone_cannot_be_rescaled(built):
@@ -287,8 +297,9 @@ def test_factors_of_ones_own_are_rescaled_if_they_say_how(built):
     for more in ([DeclaredPath(path + 0.1)], [positions(state), BodySize(jnp.ones(1))]):
         own = problem.with_factors(*more)
         other, start = in_another_unit(own, state, 5.0)
-        np.testing.assert_allclose(other.cost(start), own.cost(state), rtol=1e-9)
-        assert own.cost(state) > problem.cost(state) + 0.1
+        cost = lambda p, s: sum(f.cost(s) for f in p.factors[-len(more) :])
+        np.testing.assert_allclose(cost(other, start), cost(own, state), rtol=1e-9)
+        assert cost(own, state) > 0.1
 
 
 def test_the_scale_is_the_same_from_maps_of_all_sizes(built, solution):
@@ -301,15 +312,9 @@ def test_the_scale_is_the_same_from_maps_of_all_sizes(built, solution):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name, family, frames, hold",
-    [("E1", "follow", 40, ("cameras", "landmarks")), ("M2", "room", 60, ())],
-    ids=["held", "free"],
-)
-def test_the_scale_is_the_same_in_both_families(name, family, frames, hold):
-    """`benchmarks/bench_rescaled.py` has other lengths."""
-    case = bs.simulate_case(name, family=family, frames=frames)
-    built = bs.build(case, hold=hold)
+def test_the_scale_is_the_same_with_cameras_and_map_free():
+    """And in the other family; `benchmarks/bench_rescaled.py` has other lengths."""
+    built = bs.build(bs.simulate_case("M2", family="room", frames=60))
     factors = (0.1, 1.0, 5.0)
     found = [bs.solve(*bs.rescaled(*built, factor)) for factor in factors]
     assert {x.status for x in found} == {"converged"}
@@ -516,11 +521,10 @@ def test_optax_lowers_the_raw_cost(built):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["adam", "structured"])
-def test_solvers_are_selected_by_name(built, solver):
+def test_solvers_are_selected_by_name(built):
     problem, state = built
-    solution = bs.solve(problem, state, solver=solver)
-    assert solution.cost < problem.cost(state)
+    solution = bs.solve(problem, state, solver="adam")
+    assert solution.cost < cost_of(problem, state)
 
 
 @pytest.mark.parametrize("solver", ["optimistix_lm", "jaxopt_lm"])

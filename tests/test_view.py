@@ -283,6 +283,7 @@ def test_keypoints_are_drawn_beside_those_of_the_body(body):
     assert pictures[4][v, u].max() == BLACK
 
 
+@pytest.mark.slow
 def test_an_mp4_is_h264(tmp_path, body):
     av = pytest.importorskip("av")
     path = tmp_path / "o.mp4"
