@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from bodyslam_jax.geometry.triangulation import unit_rays
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
-from bodyslam_jax.sfm.multiview import fit_rotation
+from bodyslam_jax.sfm.multiview import fit_rotation, sampson
 from bodyslam_jax.types import Intrinsics, Tracks
 
 MAX_STILL_DISPLACEMENT_PX = 0.5
@@ -234,21 +234,6 @@ def _contradiction(
     left = sampson(E, xy_a, xy_b)
     scatter = max(limit, 1.5 * float(np.median(left[fits])))
     return left / scatter, fits
-
-
-def sampson(
-    E: Float[np.ndarray, "3 3"],
-    xy_a: Float[np.ndarray, "n 2"],
-    xy_b: Float[np.ndarray, "n 2"],
-) -> Float[np.ndarray, " n"]:
-    """Returns the first-order distance of each pair from the epipolar constraint, at
-    depth 1."""
-    one = np.ones((len(xy_a), 1))
-    a, b = np.concatenate([xy_a, one], axis=-1), np.concatenate([xy_b, one], axis=-1)
-    at_b, at_a = a @ E.T, b @ E
-    value = np.einsum("ni,ni->n", b, at_b)
-    norm = np.sqrt((at_b[:, :2] ** 2).sum(axis=-1) + (at_a[:, :2] ** 2).sum(axis=-1))
-    return np.abs(value) / np.maximum(norm, 1e-12)
 
 
 def _covers(

@@ -16,7 +16,7 @@ from scipy.stats import binom
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import Views
 from bodyslam_jax.sfm.camera_motion import choose_keyframes
-from bodyslam_jax.sfm.multiview import relative_pose
+from bodyslam_jax.sfm.multiview import essential, relative_pose, sampson
 from bodyslam_jax.types import Intrinsics, Tracks
 
 MIN_TESTED_OBSERVATIONS = 200
@@ -261,7 +261,7 @@ def _static_share(
         pose = relative_pose(*xy, 1 / focal)
         if pose is None:
             continue
-        away = _sampson(*xy, pose[0], pose[1]) * focal
+        away = sampson(essential(*pose[:2]), *xy) * focal
         good = away < threshold
         shares.append(good.mean())
         # 0.6745 is the median absolute value of a standard normal error.
@@ -269,18 +269,6 @@ def _static_share(
     if not shares:
         return 1.0, _TRACK_NOISE_PX
     return float(np.median(shares)), float(np.median(noises))
-
-
-def _sampson(xy_a, xy_b, R: np.ndarray, t: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Returns the distance of pairs of points from the epipolar geometry of R_BA and t,
-    at depth 1, as an error of each of the two points."""
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    E = cross @ R
-    one = np.ones((len(xy_a), 1))
-    a, b = np.hstack([xy_a, one]), np.hstack([xy_b, one])
-    Ea, Etb = a @ E.T, b @ E
-    size = np.sqrt((Ea[:, :2] ** 2).sum(1) + (Etb[:, :2] ** 2).sum(1))
-    return np.abs((b * Ea).sum(1)) / np.maximum(size, 1e-12)
 
 
 def _sample(

@@ -8,7 +8,8 @@ import numpy as np
 
 from bodyslam_jax.geometry.triangulation import unit_rays
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
-from bodyslam_jax.sfm.burnt_in import noise_of, sampson
+from bodyslam_jax.sfm.burnt_in import noise_of
+from bodyslam_jax.sfm.multiview import essential, sampson
 from bodyslam_jax.sfm.sfm import Reconstruction
 from bodyslam_jax.types import Intrinsics, Tracks
 
@@ -79,9 +80,7 @@ def _distance(
     length = np.linalg.norm(t)
     if found.kind != "moving" or length < 1e-9:
         return plain
-    x, y, z = t / length
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.minimum(sampson(cross @ R, before, after), plain)
+    return np.minimum(sampson(essential(R, t / length), before, after), plain)
 
 
 def _together(at: np.ndarray, step: np.ndarray) -> int:
