@@ -126,7 +126,7 @@ def turn_with_focal(
     of a track.
     """
     R, _ = fit_rotation(unit_rays(xy_a), unit_rays(xy_b), threshold)
-    log_f = 0.0
+    log_f, away = 0.0, np.zeros(len(xy_a))
     for _ in range(_NUM_TURN_STEPS):
         f = np.exp(log_f)
         ray = np.column_stack([xy_a / f, np.ones(len(xy_a))])
