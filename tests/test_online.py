@@ -30,6 +30,7 @@ from bodyslam_jax.online.window import SCALE_WALK, Window
 from bodyslam_jax.online.window_content import FRAMES, Measured
 from bodyslam_jax.people.filter import PersonFilter
 from bodyslam_jax.people.live import LivePeople
+from bodyslam_jax.sfm import multiview
 from bodyslam_jax.sfm.live_map import LiveMap
 from bodyslam_jax.sfm.live_tracks import PointFollower
 from bodyslam_jax.types import Intrinsics, Result, Sequence
@@ -57,7 +58,7 @@ def passing(frames: int, rng: np.random.Generator):
 
 
 def test_a_map_grows_from_two_views_and_locates_every_frame():
-    scene, truth, found = LiveMap(CAMERA), [], []
+    scene, truth, found = LiveMap(CAMERA, 0.02), [], []
     for T, ids, uv in passing(90, np.random.default_rng(0)):
         truth.append(T)
         if scene.begun:
@@ -74,7 +75,7 @@ def test_a_map_grows_from_two_views_and_locates_every_frame():
 
 def test_rounding_of_one_pose_is_not_in_the_next():
     """A guess is made of two poses: their rounding would be extrapolated and grow."""
-    scene = LiveMap(CAMERA)
+    scene = LiveMap(CAMERA, 0.02)
     for _, ids, uv in passing(60, np.random.default_rng(0)):
         if not scene.begun:
             scene.begin(ids, uv)
@@ -85,15 +86,58 @@ def test_rounding_of_one_pose_is_not_in_the_next():
         assert np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() < 1e-12
 
 
-def test_a_camera_that_only_turns_begins_no_map():
-    rng, scene = np.random.default_rng(1), LiveMap(CAMERA)
-    points = rng.uniform([-6, -2, 3], [6, 2, 8], (300, 3))
-    for k in range(60):
-        p_C = points @ so3.exp(np.array([0.0, 0.004 * k, 0.0]))
-        uv = project_points(CAMERA, p_C) + 0.3 * rng.standard_normal((300, 2))
-        inside = (uv > 0).all(1) & (uv < [640, 480]).all(1)
-        assert scene.begin(np.flatnonzero(inside), uv[inside]) is None
-    assert not scene.begun
+def around(turn: float, way: float, frames: int):
+    """Pixels, with noise of 0.5 px, of points all around a camera that turns (rad a
+    frame) and moves sideways (m a frame), in each frame."""
+    rng = np.random.default_rng(1)
+    azimuth, depth = rng.uniform(-np.pi, np.pi, 800), rng.uniform(3, 8, 800)
+    across = rng.uniform(-0.45, 0.45, 800)
+    points = depth[:, None] * np.column_stack(
+        [np.sin(azimuth), across, np.cos(azimuth)]
+    )
+    for k in range(frames):
+        p_C = (points - [way * k, 0, 0]) @ so3.exp(np.array([0.0, turn * k, 0.0]))
+        uv = project_points(CAMERA, p_C) + 0.5 * rng.standard_normal((800, 2))
+        inside = (p_C[:, 2] > 0.5) & (uv > 0).all(1) & (uv < [640, 480]).all(1)
+        yield np.flatnonzero(inside), uv[inside]
+
+
+def off_by(factor: float) -> LiveMap:
+    """A map that is sought with a guessed focal length."""
+    params = CAMERA.params * [factor, factor, 1, 1]
+    return LiveMap(Intrinsics(params, 640, 480, is_guess=True), 0.2)
+
+
+@pytest.mark.parametrize("factor", [0.8, 0.9, 1.0, 1.1, 1.2])
+def test_a_camera_that_only_turns_begins_no_map(factor):
+    """Whatever the error of the guessed focal length: a rotation with another one
+    explains the tracks as well as a translation does."""
+    for turn in (0.004, 0.012):  # 21 and 62 degrees
+        scene = off_by(factor)
+        for ids, uv in around(turn, 0.0, 90):
+            assert scene.begin(ids, uv) is None
+        assert not scene.begun
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.2])
+def test_a_camera_that_moves_begins_a_map_within_two_seconds(factor):
+    for turn in (0.0, 0.012):
+        scene = off_by(factor)
+        begun = (scene.begin(*seen) is not None for seen in around(turn, 0.005, 60))
+        assert any(begun)
+
+
+def test_a_rotation_tells_the_focal_length_that_explains_it():
+    views = list(around(0.012, 0.0, 40))
+    (ids_a, a), (ids_b, b) = views[0], views[-1]
+    _, i, j = np.intersect1d(ids_a, ids_b, return_indices=True)
+    for factor in (0.8, 1.2):
+        xy = ((uv - [319.5, 239.5]) / (525 * factor) for uv in (a[i], b[j]))
+        pixel = 1 / (525 * factor)
+        found, away = multiview.turn_with_focal(*xy, pixel, 0.2)
+        assert found * factor == pytest.approx(1.0, abs=0.02)
+        # The length of two errors of 0.5 px has a median of 0.59 px.
+        assert np.median(away) / pixel == pytest.approx(0.59, abs=0.1)
 
 
 def textured(rng: np.random.Generator) -> np.ndarray:

@@ -13,7 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 
 from bodyslam_jax.body import BodyModel
-from bodyslam_jax.config import Config
+from bodyslam_jax.config import FOCAL_SIGMA, Config
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.online.bodies import LiveBodies
@@ -22,7 +22,7 @@ from bodyslam_jax.online.record import Counts, Record, Seen
 from bodyslam_jax.online.slots import Slots
 from bodyslam_jax.online.window import Solved, Window
 from bodyslam_jax.online.window_content import FRAMES, Measured
-from bodyslam_jax.sfm.live_map import MAX_FIXED_ROTATION_ERROR_PX, LiveMap
+from bodyslam_jax.sfm.live_map import LiveMap
 from bodyslam_jax.sfm.live_tracks import PointFollower
 from bodyslam_jax.sfm.live_turning import TurningCamera
 from bodyslam_jax.types import Intrinsics
@@ -112,7 +112,11 @@ class Maps:
     def _no_map(self, intrinsics: Intrinsics) -> None:
         """Starts in a world without a map, and waits for one to begin."""
         self.intrinsics = intrinsics
-        self.map = self.sought = LiveMap(intrinsics)
+        error = intrinsics.focal_sigma, intrinsics.params[0]
+        relative = FOCAL_SIGMA if error[0] is None else error[0] / error[1]
+        if intrinsics.is_guess:
+            relative = self.config.structure.focal_sigma
+        self.map = self.sought = LiveMap(intrinsics, float(relative))
         self.world = World()
         self.fixed_at: float | None = None
         """Time at which the camera is fixed if no map has begun, s; `None` before the
@@ -223,8 +227,6 @@ class Maps:
         frames = self.record.frames
         del frames[len(frames) - len(rows) + 1 :]
         self.map = camera
-        assert self.sought is not None
-        self.sought.max_rotation_error = MAX_FIXED_ROTATION_ERROR_PX
         self._hold()
         self.said = (
             f"the camera showed no parallax for {MAX_START_S:.0f} s "

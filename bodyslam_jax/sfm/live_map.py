@@ -16,7 +16,13 @@ from jaxtyping import Float, Int
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
-from bodyslam_jax.sfm.multiview import relative_pose, resect
+from bodyslam_jax.sfm.multiview import (
+    epipolar_distance,
+    relative_pose,
+    resect,
+    translation_is_told,
+    turn_with_focal,
+)
 from bodyslam_jax.types import Intrinsics
 
 _MAX_ERROR_PX = 3.0
@@ -48,10 +54,8 @@ share of it that they need."""
 _MAX_OUTLIER_SHARE = 0.25
 """Largest share of outliers among the views of a new point: tracks have outliers."""
 _MAX_ROTATION_ERROR_PX = 2.0
-"""Largest median distance from a pure rotation of two views without parallax, px."""
-MAX_FIXED_ROTATION_ERROR_PX = 6.0
-"""The same limit where the camera was fixed before, px: noise of tracks and a wrong
-focal length together stay below it, as offline (`sfm`)."""
+"""Largest median distance from a rotation, with the focal length free, of two views
+that begin no map, px: what distortion of an unknown lens adds to noise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,16 +71,16 @@ class Keyframe:
 class LiveMap:
     """Points by the number of their track, keyframes, and the last camera."""
 
-    def __init__(self, intrinsics: Intrinsics) -> None:
+    def __init__(self, intrinsics: Intrinsics, focal_sigma: float) -> None:
+        """**Arguments:** `focal_sigma`: relative standard deviation of the focal
+        length, with which a rotation may explain the tracks before a map begins."""
+        self.focal_sigma = focal_sigma
         self.K, self.distortion = as_opencv(intrinsics.params)
         size = max(intrinsics.width, intrinsics.height) / 640
         self.threshold = _MAX_ERROR_PX * max(size, 1.0) / float(self.K[0, 0])
         self.points: dict[int, Float[np.ndarray, " 3"]] = {}
         self.keyframes: deque[Keyframe] = deque(maxlen=_NUM_KEYFRAMES)
         self.waiting: deque[Keyframe] = deque(maxlen=_MAX_WAITING_FRAMES)
-        self.max_rotation_error = _MAX_ROTATION_ERROR_PX
-        """Largest median distance from a pure rotation of two views that begin no map,
-        px."""
         self.T_WC = np.eye(4)
         self.step = np.eye(4)
         """The last motion, from camera to camera."""
@@ -192,9 +196,11 @@ class LiveMap:
         if found is None or found[2].mean() < _MIN_FIRST_INLIER_SHARE:
             return False
         R, t, good = found
-        turned = np.column_stack([xy_a, np.ones(len(xy_a))]) @ R.T
-        away = np.linalg.norm(turned[:, :2] / turned[:, 2:] - xy_b, axis=1)
-        if np.median(away) < self.max_rotation_error * pixel:
+        _, turned = turn_with_focal(xy_a, xy_b, pixel, self.focal_sigma)
+        if np.median(turned) < _MAX_ROTATION_ERROR_PX * pixel:
+            return False
+        across = epipolar_distance(R, t, xy_a, xy_b)
+        if not translation_is_told(turned, across, pixel):
             return False
         R_CW = np.stack([np.eye(3), R])
         centre = np.stack([np.zeros(3), -R.T @ t])
