@@ -1,10 +1,17 @@
 """The low pass: what it leaves alone, what it takes away, and where it stops."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+from estimates import standing_people, still_camera
+from scenes import body_model
 from scipy.spatial.transform import Rotation
 
+from bodyslam_jax.config import Config
 from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
+from bodyslam_jax.pipeline.to_metric import to_metric
+from bodyslam_jax.types import Bodies, Intrinsics, Sequence
 
 FPS = 30.0
 ALL = np.ones(200, bool)
@@ -60,3 +67,29 @@ def test_a_steady_turn_through_pi_stays_one_and_noise_shrinks():
     assert angle(clean).max() < 1e-3
     found = low_pass_rotations(noisy.as_rotvec()[:, None], ALL, FPS, 5.0)[:, 0]
     assert angle(found).mean() < 0.6 * angle(noisy.as_rotvec()).mean()
+
+
+def test_only_regressed_bodies_are_low_passed():
+    h, t = 2, 30
+    present = np.zeros((h, t), bool)
+    present[0] = True  # the second person is fitted to keypoints
+    nothing = np.zeros((h, t, 72)), np.zeros((h, t, 10)), np.zeros((h, t, 3))
+    camera = Intrinsics(np.array([500.0, 500.0, 320.0, 240.0]), 640, 480)
+    bodies = Bodies(present, *nothing)
+    sequence = Sequence("two", None, np.arange(t) / FPS, camera, bodies=bodies)
+    joint = standing_people(sequence)
+    shaking = 0.01 * (-1.0) ** np.arange(t)
+    joint.roots[:, :, 0, 3] = shaking
+    joint.poses[:, :, 15, 2] = shaking
+    found, _ = to_metric(
+        sequence, Config(), body_model(), still_camera(sequence), joint
+    )
+    width = np.ptp(found.joints[:, 5:-5, 0, 0], axis=1)
+    turn = np.ptp(found.poses[:, 5:-5, 3 * 16 + 2], axis=1)
+    assert width[0] < 0.004 and turn[0] < 0.004
+    np.testing.assert_allclose([width[1], turn[1]], 0.02, rtol=1e-3)
+    same = dataclasses.replace(Config(), smoothing_hz=None)
+    plain, _ = to_metric(sequence, same, body_model(), still_camera(sequence), joint)
+    np.testing.assert_allclose(
+        np.ptp(plain.joints[:, :, 0, 0], axis=1), 0.02, rtol=1e-3
+    )

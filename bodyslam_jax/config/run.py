@@ -82,8 +82,9 @@ class Config(Known):
     """When motion is predicted: once, before the joint solve, or again after each
     accepted step. No derivative of the prediction enters the solve."""
     smoothing_hz: float | None = 6.0
-    """Cut-off frequency above which people's motion in the result is smoothed as noise,
-    Hz. Without it, nothing is smoothed."""
+    """Cut-off frequency above which the motion of regressed bodies is smoothed as noise
+    in the result, Hz. Without it, nothing is smoothed; bodies that are fitted to
+    keypoints never are."""
     limits: Limits = Limits()
 
     def __post_init__(self):

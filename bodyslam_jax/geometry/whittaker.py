@@ -1,9 +1,9 @@
 """A low-pass filter for postures and paths of people, as used in gait laboratories.
 
-The estimate follows the keypoints of each frame, including their noise, as the graph
-couples postures of successive frames only through the AR(1) errors of the regressor:
-stronger smoothing within the estimation would reduce the swing of the legs, from which
-the scale is estimated. So noise is filtered afterwards. Whittaker's smoother minimises
+Regressed bodies have noise of their own in each frame, and the graph couples postures
+of successive frames only through the AR(1) errors of the regressor: stronger smoothing
+within the estimation would reduce the swing of the legs, from which the scale is
+estimated. So noise is filtered afterwards. Whittaker's smoother minimises
 `|x - y|² + λ |D² x|²` over each run of frames; its gain at frequency f is
 `1 / (1 + λ (2 - 2 cos(2π f / fps))²)`: it has no lag, preserves constant speed, and
 halves amplitudes at the cutoff.

@@ -94,8 +94,8 @@ def _placed(
     Float[np.ndarray, "h t 3"],
     Float[np.ndarray, "h t 24 3"],
 ]:
-    """Returns low-passed poses (rad), `trans` and joints (m) of people in the world of
-    the cameras `T_WC`."""
+    """Returns poses (rad), `trans` and joints (m) of people in the world of the cameras
+    `T_WC`; of regressed bodies they are low-passed."""
     T_WH = T_WC @ joint.roots
     root = so3.log(np.asarray(T_WH[..., :3, :3]))
     poses = np.concatenate([root, joint.poses.reshape(*root.shape[:2], 69)], axis=-1)
@@ -139,13 +139,17 @@ def sole_height(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float
 
 
 def _smoothed(sequence, config, present, poses, pelvis):
-    """Low-passes people's rotations and paths in the world at `smoothing_hz`."""
+    """Low-passes regressed rotations and their paths in the world at `smoothing_hz`.
+
+    Bodies fitted to keypoints are unchanged: the fit's prior on motion leaves hardly
+    any noise, and the filter would take their motion (`benchmarks/experiments.md`).
+    """
     if config.smoothing_hz is None:
         return poses, pelvis
     how = (sequence.fps, config.smoothing_hz)
     poses, pelvis = poses.copy(), pelvis.copy()
-    for h, frames in enumerate(present):
+    for h in np.flatnonzero(~people.without_bodies(sequence)):
         joints = poses[h].reshape(-1, 24, 3)
-        poses[h] = low_pass_rotations(joints, frames, *how).reshape(-1, 72)
-        pelvis[h] = low_pass(pelvis[h], frames, *how)
+        poses[h] = low_pass_rotations(joints, present[h], *how).reshape(-1, 72)
+        pelvis[h] = low_pass(pelvis[h], present[h], *how)
     return poses, pelvis
