@@ -61,8 +61,9 @@ def _inflation(sequence: Sequence, weights: GraphWeights) -> float:
 def _keypoint_loss(
     sequence: Sequence, sigma: Float[np.ndarray, "h t 25"], weights: GraphWeights
 ) -> graph.GemanMcClure:
-    """Returns a loss whose scale in px does not depend on inflation and confidence:
-    these lower a keypoint's weight, but not the distance at which it is an outlier."""
+    """Returns a loss whose scale in px does not depend on the inflation, which lowers a
+    keypoint's weight, but not the distance at which it is an outlier; with
+    `weights.keypoint_sigma`, it does not depend on the confidence either."""
     if weights.keypoint_sigma is None:
         scale = weights.keypoint_loss / _inflation(sequence, weights)
         return graph.GemanMcClure(jnp.asarray(scale))

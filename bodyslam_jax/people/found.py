@@ -27,7 +27,8 @@ _WRIST_POWER = 3
 """Exponent of a wrist's confidence. The network guesses a wrist behind the trunk, often
 at the position of the other wrist: on ten rendered sequences the error was 2.5 times
 that of a certain wrist at a confidence of 0.8, and 7 times at 0.5. Errors of other
-joints are about inverse to their confidence."""
+joints are about inverse to their confidence. What maximum likelihood has in place of it
+is no better (`benchmarks/keypoints.md`)."""
 
 
 @dataclasses.dataclass(frozen=True)
