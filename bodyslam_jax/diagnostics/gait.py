@@ -16,7 +16,7 @@ from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.types import Result
 
 _GRAVITY_M_S2 = 9.81
-"""Standard gravity, 9.80665, to what a walk ratio is measured to."""
+"""Standard gravity."""
 _UP = np.array([0.0, 1.0, 0.0])
 _HORIZONTAL_AXES = [0, 2]
 _LEG_JOINTS = ([1, 4, 7], [2, 5, 8])

@@ -163,9 +163,8 @@ def are_errors(
         away = (innovation**2).sum(-1) / variance[:, None]
         near = seen[k] & (away < _GATE_SIGMAS**2)
         paid = (seen[k] * np.minimum(away, _GATE_SIGMAS**2)).sum(-1) * _POINT_WEIGHT / 2
-        prior = np.array(
-            [0.0, _ERROR_COST * min(dt, 1 / 30) if k else _ERROR_COST / 30]
-        )
+        # Frames closer than 1/30 s count alike.
+        prior = np.array([0.0, _ERROR_COST * (min(dt, 1 / 30) if k else 1 / 30)])
         changed = ((labels[:, None] & 1) != np.arange(2)) & (k > 0)
         total = cost[:, None] + paid + costs[k] + prior + _CHANGE_COST * changed
         gain = (covariance[..., 0] / variance[..., None])[:, None] * near[..., None]

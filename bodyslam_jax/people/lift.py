@@ -31,6 +31,7 @@ NUM_FEATURES = (2 * NUM_SIDE_FRAMES + 1) * 25 * 3
 _KEPT_SHARE = 0.8
 """Share of hidden units that dropout keeps in training."""
 _NECK, _HIPS = 1, 8
+"""Keypoints of BODY_25."""
 _INPUT_RMS = 0.5
 """Root mean square of the input coordinates, in the frame where it is largest."""
 _MIN_KEYPOINTS = 6
@@ -59,6 +60,7 @@ class Lifter(eqx.Module):
         h = h + jax.nn.relu(inner @ self.hidden[1] + self.bias[2])
         h = drop(h + jax.nn.relu(h @ self.hidden[2] + self.bias[3]), 2)
         out = h @ self.last + self.last_bias
+        # 2 k + 7 outputs, as `last` says.
         k = (out.shape[-1] - 7) // 2
         return Lifted(
             orientation=_orthonormal(out[..., k : k + 6]),

@@ -58,9 +58,9 @@ _OFFSETS = (
 """Offsets of a detector's keypoints from SMPL's, constant for a detector and person:
 keypoints, axis of the bone they are attached to, prior standard deviation (m), mirrored
 in x. They are estimated as extra shape components; without them an offset of the hip of
-3 cm would appear as legs bent by 20 degrees. The deviations are as large as what the
-detectors' definitions differ by from the joints, 0 to 3.8 % of the stature along an
-axis and 1.2 to 2.0 % after the definition (`benchmarks/keypoints.md`)."""
+3 cm would appear as legs bent by 20 degrees. The deviations are of the size of what is
+left of a detector's errors after its definition, 0.6 to 2.8 % of the stature along an
+axis (`benchmarks/keypoints.md`)."""
 NUM_SHAPE = 10 + len(_OFFSETS)
 """Number of shape components: β, then the detector's offsets in standard deviations."""
 _LEFT_KEYPOINTS = (5, 6, 7, 12, 13, 14, 16, 18, 19, 20, 21)

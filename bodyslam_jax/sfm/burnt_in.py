@@ -31,10 +31,10 @@ _PAIR_GAPS_FRAMES = (6, 15, 30, 60)
 """Distances, in frames, of the two frames of a pair."""
 _MAX_ANCHORS = 300
 """Largest number of first frames of pairs."""
-_MIN_MOVING_RATIO = 4.0
+MIN_MOVING_RATIO = 4.0
 """Least ratio of the median displacement of moving points to the limit of still ones,
 at which the two can be separated."""
-_MIN_MOVING_POINTS = 15
+MIN_MOVING_POINTS = 15
 _MIN_INCONSISTENT_PAIRS = 2
 _MIN_INFORMATIVE_PAIRS = (3, 0.1)
 """Least number of pairs in which a scene moves beside still points, and their share of
@@ -99,9 +99,9 @@ def find_burnt_in(tracks: Tracks, intrinsics: Intrinsics, num_frames: int) -> Bu
         stays[ids[still]] += 1
         resting += int(still.any())
         movers = moved > 2 * limit
-        if not still.any() or movers.sum() < _MIN_MOVING_POINTS:
+        if not still.any() or movers.sum() < MIN_MOVING_POINTS:
             continue
-        if np.median(moved[movers]) < _MIN_MOVING_RATIO * limit:
+        if np.median(moved[movers]) < MIN_MOVING_RATIO * limit:
             continue
         away, fits = _contradiction(
             rays(at_a, K, distortion),

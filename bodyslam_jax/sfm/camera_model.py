@@ -16,7 +16,13 @@ from bodyslam_jax.config import Structure
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.bundle import ERROR_PER_SIGMA, Scene, Views, errors
 from bodyslam_jax.sfm.burnt_in import noise_of
-from bodyslam_jax.sfm.lens import OTHER_FOCAL_MODEL, Lens, LensPrior, examine_lens
+from bodyslam_jax.sfm.lens import (
+    MIN_SIGMA_PX,
+    OTHER_FOCAL_MODEL,
+    Lens,
+    LensPrior,
+    examine_lens,
+)
 from bodyslam_jax.sfm.sfm import MAX_ROTATION_ERROR_PX, Reconstruction, reconstruct
 from bodyslam_jax.sfm.upright_people import plausibility
 from bodyslam_jax.sfm.zoom import MIN_LOG_ZOOM, tracks_without_zoom, turning_zoom
@@ -55,8 +61,6 @@ _OTHER_FOCAL_FACTORS = (0.63, 0.8, 1.25)
 """Factors on a guessed focal length with which the ordinary camera is tried again: they
 cover two standard deviations of the guess downwards, where wide lenses are, and one
 upwards."""
-_MIN_SIGMA_PX = 0.2
-"""Least standard deviation of an observation, px: trackers are not more precise."""
 _UNEXPLAINED_COST = 9.21
 """Cost of an unexplained observation: the squared error, in variances, that is exceeded
 by 1 % of observations (chi-square of two degrees of freedom)."""
@@ -215,7 +219,7 @@ def _other_focal(
         again = reconstruct(tracks, camera, len(found.registered), config)
         if not _locates_as_many(again, found):
             continue
-        sigma = max(again.error / ERROR_PER_SIGMA, _MIN_SIGMA_PX)
+        sigma = max(again.error / ERROR_PER_SIGMA, MIN_SIGMA_PX)
         gain = _misfit(tracks, guess, found, sigma)
         gain -= _misfit(tracks, camera, again, sigma)
         # Errors of a track are correlated: `focal_runs` observations count as one.

@@ -44,6 +44,8 @@ _MAX_TRACKS, _VIEWS_PER_TRACK = 400, 8
 _MIN_BLOCK_FRAMES, _MAX_BLOCKS = 10, 20
 """Least length of a block of time, within which errors are correlated, and
 largest number of blocks."""
+_MIN_DEPTH = 0.05
+"""Depth, relative to that in the middle view, below which a point is behind."""
 _ERROR_BEHIND_CAMERA = 10.0
 """Error, at depth 1, that counts for a point behind the camera."""
 _NUM_ITERATIONS = 6
@@ -317,8 +319,8 @@ def _errors_of_best_points(
             point[:, 2] = np.maximum(point[:, 2], 0.0)
         ray = np.concatenate([point[:, :2], np.ones((num, 1))], axis=1)
         p = (R @ ray[:, None, :, None])[..., 0] + point[:, None, 2:] * t
-        front = p[..., 2] > 0.05
-        z = np.where(front, p[..., 2], 0.05)[..., None]
+        front = p[..., 2] > _MIN_DEPTH
+        z = np.where(front, p[..., 2], _MIN_DEPTH)[..., None]
         predicted = p[..., :2] / z
         away = xy - predicted
         error = np.where(front, np.linalg.norm(away, axis=-1), _ERROR_BEHIND_CAMERA)

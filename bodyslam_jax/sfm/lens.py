@@ -29,6 +29,8 @@ from bodyslam_jax.sfm.lens_fit import (
     Unknowns,
 )
 
+MIN_SIGMA_PX = 0.2
+"""Least standard deviation of an observation, px: trackers are not more precise."""
 OTHER_FOCAL_MODEL = ("focal",)
 """The ordinary camera with another focal length than a calibration's. Deviations from a
 calibration are compared with it, as they would otherwise win by a free focal length."""
@@ -134,7 +136,7 @@ def examine_lens(
     Args:
         scene: cameras and points to begin with.
         registered: frames whose camera is known.
-        pixel: size of a pixel at depth 1; a fifth of it is the least assumed error.
+        pixel: size of a pixel at depth 1.
         rows: height of the image at depth 1.
     """
     chosen = _choose(scene, LensViews.of(views, rows), registered)
@@ -143,7 +145,8 @@ def examine_lens(
     frames, start, views = chosen
     count, basis = _knots(frames)
     start = dataclasses.replace(start, lens=np.zeros(4 + count))
-    fit = LensFit(views, basis, _blocks(views, len(start.points)), pixel / 5)
+    least = MIN_SIGMA_PX * pixel
+    fit = LensFit(views, basis, _blocks(views, len(start.points)), least)
     every = _basis(np.arange(len(registered)), int(frames[0]), int(frames[-1]), count)
     found: tuple[Lens, ...] = ()
     for _ in range(_MAX_FITS):

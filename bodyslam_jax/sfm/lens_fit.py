@@ -266,6 +266,7 @@ def _predict(v: LensViews, basis: np.ndarray, x: Unknowns):
     front = p_C[:, 2] > 1e-6
     z = np.where(front, p_C[:, 2], 1.0)
     q = p_C[:, :2] / z[:, None]
+    # Held beyond 63 degrees from the axis, where the polynomial would run away.
     r2 = np.minimum((q**2).sum(axis=-1), 4.0)
     zoom = x.lens[0] + basis[v.frame] @ x.lens[4:]
     half = 0.5 * x.lens[1] * np.array([1.0, -1.0])

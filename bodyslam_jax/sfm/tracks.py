@@ -17,7 +17,11 @@ from jaxtyping import UInt8
 from bodyslam_jax.config import Tracking
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.io.video import frames
-from bodyslam_jax.sfm.burnt_in import still_limit
+from bodyslam_jax.sfm.burnt_in import (
+    MIN_MOVING_POINTS,
+    MIN_MOVING_RATIO,
+    still_limit,
+)
 from bodyslam_jax.sfm.features import epipolar_inliers, make_brisk, match, spread
 from bodyslam_jax.sfm.person_mask import person_masks
 from bodyslam_jax.types import Sequence, Tracks
@@ -27,9 +31,6 @@ _REFILL_GAP_FRAMES = 3
 _KEYFRAME_STEP_FRAMES = 12
 """Number of frames between two keyframes."""
 _NUM_KEYFRAMES = 12
-_MIN_MOVING_POINTS = 15
-_MIN_MOVING_RATIO = 4.0
-"""Least ratio of the displacement of a moving point to the limit of still ones."""
 _MAX_ROUND_TRIP_PX = 0.5
 """Largest forward-backward error of KLT, px: assumes that KLT localises a window to
 clearly better than that, in images of any size."""
@@ -222,8 +223,8 @@ class _Tracker:
         # Points that stay at their pixel fit every essential matrix without rotation:
         # if they are burnt into the image, the moving points would be dropped instead.
         moved = np.linalg.norm(live.uv[now] - uv[then], axis=-1)
-        moving = moved > _MIN_MOVING_RATIO * still_limit(self.size)
-        if _MIN_MOVING_POINTS < moving.sum() < 0.9 * len(moving):
+        moving = moved > MIN_MOVING_RATIO * still_limit(self.size)
+        if MIN_MOVING_POINTS < moving.sum() < 0.9 * len(moving):
             still = moved < still_limit(self.size)
             now, then = now[~still], then[~still]
         inlier = epipolar_inliers(

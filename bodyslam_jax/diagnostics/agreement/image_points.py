@@ -33,7 +33,7 @@ _MAX_DISTANCE_SIZES = 3.0
 _MIN_CONFIDENCE_RATIO = 0.25
 """Least confidence of a keypoint, relative to the 90 % quantile of the person's."""
 _MIN_DEPTH_M = 0.05
-"""Depth, m, below which a point is behind the camera: inside its housing."""
+"""Depth, m, below which a point counts as behind the camera."""
 _MIN_SIZE_PX = 10.0
 """Lower bound on sizes in denominators, px."""
 
