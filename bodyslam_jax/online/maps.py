@@ -57,6 +57,10 @@ NO_POINTS = (
     "no parallax, and too few points to tell whether the camera stands still: nobody "
     "is in the result before it moves; --static-camera says that it stands still"
 )
+LITTLE_PARALLAX = (
+    "the camera moves, and so far too little for a map: nobody is in the result before "
+    "one begins"
+)
 _NUM_RELOCALISATION_POINTS = 100
 """Number of points with which a camera resumes tracking after it was lost."""
 
@@ -171,6 +175,7 @@ class Maps:
             frames = self.record.frames
             del frames[len(frames) - len(rows) + 1 :]
         self.map, self.sought = scene, None
+        self.warnings.pop(LITTLE_PARALLAX, None)
         for row, pose in zip(rows, poses, strict=True):
             self._take(row.time, pose, row.ids, row.uv, row.people)
         self.waiting.clear()
@@ -212,8 +217,13 @@ class Maps:
 
     def _begin_fixed(self, timestamp: float) -> bool:
         """Begins with a fixed camera at the waiting frames, and returns true; false if
-        their points do not fit one."""
-        assert self.intrinsics is not None
+        their points show that it moves, or do not fit one."""
+        assert self.intrinsics is not None and self.sought is not None
+        if self.sought.moving:
+            self.warnings[LITTLE_PARALLAX] = None
+            self.fixed_at = timestamp + _FIXED_RETRY_S
+            return False
+        self.warnings.pop(LITTLE_PARALLAX, None)
         camera = TurningCamera(self.intrinsics)
         rows = list(self.waiting)
         for row in rows:

@@ -32,8 +32,10 @@ _MIN_INLIERS = 12
 _MIN_INLIER_SHARE = 0.3
 """Least share of inliers among the known points."""
 _MIN_FIRST_PARALLAX_RAD = np.radians(1.5)
-"""Least median parallax of two views that begin a map, rad."""
+"""Least parallax of `_MIN_FIRST_POINTS` points of two views that begin a map, rad."""
 _MIN_FIRST_POINTS = 40
+"""Least number of points with which a map begins. Before a camera that moves along its
+view most points have little parallax, however far it moves."""
 _MIN_FIRST_INLIER_SHARE = 0.7
 """Least share of inliers of two views that begin a map."""
 _MAX_WAITING_FRAMES = 240
@@ -81,6 +83,9 @@ class LiveMap:
         self.points: dict[int, Float[np.ndarray, " 3"]] = {}
         self.keyframes: deque[Keyframe] = deque(maxlen=_NUM_KEYFRAMES)
         self.waiting: deque[Keyframe] = deque(maxlen=_MAX_WAITING_FRAMES)
+        self.moving = False
+        """True if the last frame showed with an earlier one that the camera moves, with
+        or without the parallax that a map needs."""
         self.T_WC = np.eye(4)
         self.step = np.eye(4)
         """The last motion, from camera to camera."""
@@ -103,6 +108,7 @@ class LiveMap:
         count = len(self.waiting)
         tried = {0, count // 2, 3 * count // 4}
         tried |= {count - lag for lag in _LAGS_FRAMES if count > 4 * lag}
+        self.moving = False
         for k in sorted(tried):
             if k < count - 5 and self._two_views(self.waiting[k], now):
                 break
@@ -202,6 +208,7 @@ class LiveMap:
         across = epipolar_distance(R, t, xy_a, xy_b)
         if not translation_is_told(turned, across, pixel):
             return False
+        self.moving = True
         R_CW = np.stack([np.eye(3), R])
         centre = np.stack([np.zeros(3), -R.T @ t])
         rows = np.flatnonzero(good)
@@ -213,10 +220,7 @@ class LiveMap:
         angle = widest_angle(given[1], which, places)
         front = (places @ R_CW[1].T - R_CW[1] @ centre[1])[:, 2] > 0
         front &= places[:, 2] > 0
-        if (
-            front.sum() < _MIN_FIRST_POINTS
-            or np.median(angle[front]) < _MIN_FIRST_PARALLAX_RAD
-        ):
+        if (angle[front] > _MIN_FIRST_PARALLAX_RAD).sum() < _MIN_FIRST_POINTS:
             return False
         unit = float(np.median(places[front, 2]))
         ids = a.ids[i][rows]
