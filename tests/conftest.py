@@ -96,6 +96,12 @@ def programs_within_memory():
 
 
 @pytest.fixture
+def forget():
+    """Drops compiled programs within a test that needs several large ones."""
+    return drop_programs
+
+
+@pytest.fixture
 def key() -> jax.Array:
     """A fixed random key; a test that wants another one says why."""
     return jax.random.key(0)

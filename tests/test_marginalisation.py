@@ -316,12 +316,15 @@ def test_what_is_left_is_as_uncertain_as_in_the_whole():
 
 
 @pytest.mark.slow
-def test_a_simulated_clip_is_solved_in_two_windows_as_it_is_whole():
+def test_a_simulated_clip_is_solved_in_two_windows_as_it_is_whole(forget):
     """With the factors and the motion model of a run."""
     problem, state = bs.build(bs.simulate_case("M2", frames=40))
     well = (Stage(max_steps=60, rtol=1e-9),)
+    forget()  # all at once they take 2.7 GB
     batch = bs.solve(problem, state, schedule=well).state
+    forget()
     left = marginalise(problem, batch, 10)
+    forget()
     found = bs.solve(left.problem, left.state, schedule=well).state
     away = farthest(left.problem, found, remaining(batch, left, 10))
     assert away["scale"] < 1e-5
