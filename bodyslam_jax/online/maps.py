@@ -219,6 +219,7 @@ class Maps:
         """Begins with a fixed camera at the waiting frames, and returns true; false if
         their points show that it moves, or do not fit one."""
         assert self.intrinsics is not None and self.sought is not None
+        self.sought.forwards = self.sought.moving
         if self.sought.moving:
             self.warnings[LITTLE_PARALLAX] = None
             self.fixed_at = timestamp + _FIXED_RETRY_S

@@ -32,10 +32,9 @@ _MIN_INLIERS = 12
 _MIN_INLIER_SHARE = 0.3
 """Least share of inliers among the known points."""
 _MIN_FIRST_PARALLAX_RAD = np.radians(1.5)
-"""Least parallax of `_MIN_FIRST_POINTS` points of two views that begin a map, rad."""
+"""Least median parallax of two views that begin a map, rad; where the camera moves and
+none begins (`LiveMap.forwards`), that of `_MIN_FIRST_POINTS` points."""
 _MIN_FIRST_POINTS = 40
-"""Least number of points with which a map begins. Before a camera that moves along its
-view most points have little parallax, however far it moves."""
 _MIN_FIRST_INLIER_SHARE = 0.7
 """Least share of inliers of two views that begin a map."""
 _MAX_WAITING_FRAMES = 240
@@ -86,6 +85,9 @@ class LiveMap:
         self.moving = False
         """True if the last frame showed with an earlier one that the camera moves, with
         or without the parallax that a map needs."""
+        self.forwards = False
+        """True if the camera is taken to move along its view, where most points have
+        little parallax, however far it moves."""
         self.T_WC = np.eye(4)
         self.step = np.eye(4)
         """The last motion, from camera to camera."""
@@ -220,7 +222,11 @@ class LiveMap:
         angle = widest_angle(given[1], which, places)
         front = (places @ R_CW[1].T - R_CW[1] @ centre[1])[:, 2] > 0
         front &= places[:, 2] > 0
-        if (angle[front] > _MIN_FIRST_PARALLAX_RAD).sum() < _MIN_FIRST_POINTS:
+        least = _MIN_FIRST_PARALLAX_RAD
+        count = (angle[front] > least).sum() if self.forwards else front.sum()
+        if count < _MIN_FIRST_POINTS:
+            return False
+        if not self.forwards and np.median(angle[front]) < least:
             return False
         unit = float(np.median(places[front, 2]))
         ids = a.ids[i][rows]
