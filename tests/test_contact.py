@@ -215,6 +215,27 @@ def test_the_plane_is_where_feet_stand_and_believed_as_far_as_it_explains(rng):
 
 
 @pytest.mark.slow
+def test_feet_of_climbers_are_held_at_their_own_height(rng):
+    state = scenes.truth(rng, frames=20, people=2, landmarks=4)
+    up, everywhere = jnp.array([0.0, -1.0, 0.0]), jnp.ones((2, 20))
+    of = lambda height: g.GroundContact(
+        scenes.body_model(), up, 2 * everywhere, 0.3 * everywhere, height
+    )
+    C_CW = jnp.swapaxes(state.cameras[:, :3, :3], 1, 2)
+    lifted = state.roots.at[1, :, :3, 3].add(0.5 * C_CW @ up)
+    state = eqx.tree_at(lambda s: s.roots, state, lifted)
+    stands = np.ones((2, 20, 4))
+
+    def apart(height):
+        found = stand_on_plane(of(height), state, stands, 30.0)
+        bare = eqx.tree_at(lambda f: f.sigma, found, everywhere)
+        return np.abs(np.median(np.asarray(g.residual_of(bare, state))[..., 0], 1))
+
+    assert apart(0 * everywhere).max() > 0.2
+    assert apart(jnp.array([[0.0], [0.1]]) * everywhere).max() < 0.02
+
+
+@pytest.mark.slow
 def test_standing_feet_stop_sliding_and_nothing_else_changes():
     """From a regressor's bodies: the speed of the lower foot falls, to the truth's."""
     case = simulate_case("E2", frames=60, family="follow")

@@ -2,16 +2,19 @@
 
 import dataclasses
 
+import estimates
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
 
-from bodyslam_jax import diagnostics, graph, initialisation, motion
-from bodyslam_jax.config import GraphWeights
+from bodyslam_jax import diagnostics, graph, initialisation, motion, simulation
+from bodyslam_jax.body import load_body_model
+from bodyslam_jax.config import Config, GraphWeights, Simulation
 from bodyslam_jax.diagnostics import scale_uncertainty
 from bodyslam_jax.geometry.ground_plane import find_ground
+from bodyslam_jax.pipeline.to_metric import to_metric
 from bodyslam_jax.types import Result, ScaleStart
 
 
@@ -122,6 +125,30 @@ def test_the_unit_of_the_map_does_not_matter_to_contact():
         there.scales(other), factor * here.scales(state), rtol=1e-12
     )
     np.testing.assert_allclose(there.residual(other), here.residual(state), atol=1e-12)
+
+
+def test_the_floor_is_below_what_somebody_stands_on():
+    made = simulation.simulate(Simulation(sequence="M1", length=15))
+    sequence, body = simulation.as_sequence(made), load_body_model()
+    cameras, joint = (
+        estimates.still_camera(sequence),
+        estimates.standing_people(sequence),
+    )
+    rung = np.zeros((*joint.present.shape, 3))
+    rung[..., 1] = -0.5  # y of the camera is down
+    plain, raised = (
+        to_metric(
+            sequence,
+            Config(),
+            body,
+            cameras,
+            dataclasses.replace(joint, above_ground=above),
+        )[0]
+        for above in (None, rung)
+    )
+    higher = raised.joints - plain.joints
+    np.testing.assert_allclose(higher[..., 1], 0.5, atol=0.02)
+    np.testing.assert_allclose(higher[..., [0, 2]], 0.0, atol=0.02)
 
 
 def test_cues_are_weighted_by_their_errors_and_say_when_they_disagree():

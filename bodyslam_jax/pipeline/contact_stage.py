@@ -125,8 +125,10 @@ def stand_on_plane(
     it, on a step or a kerb, have no weight.
     """
     climbs = np.asarray(contact.height).any(axis=1)
-    contact = eqx.tree_at(lambda f: f.height, contact, jnp.zeros_like(contact.height))
-    bare = eqx.tree_at(lambda f: f.sigma, contact, jnp.ones_like(contact.sigma))
+    none = jnp.zeros_like(contact.height)
+    bare = eqx.tree_at(
+        lambda f: (f.sigma, f.height), contact, (jnp.ones_like(contact.sigma), none)
+    )
     height = np.asarray(graph.residual_of(bare, state))[..., 0]
     stands = probability.max(axis=-1)
     used = np.isfinite(np.asarray(contact.sigma)) & (stands > 0.5)
@@ -147,7 +149,7 @@ def stand_on_plane(
     shifted = np.asarray(contact.offset) - offset / float(state.scale)
     return eqx.tree_at(
         lambda f: (f.offset, f.sigma),
-        contact,
+        bare,
         (
             jnp.asarray(shifted, contact.offset.dtype),
             jnp.asarray(sigma, contact.sigma.dtype),
