@@ -22,7 +22,7 @@ from bench_static import UP, looking
 from bodyslam_jax import evaluation, motion, pipeline, simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, Simulation
-from bodyslam_jax.geometry.stances import in_free_fall
+from bodyslam_jax.ground.stances import in_free_fall
 from bodyslam_jax.simulation import sequences
 from bodyslam_jax.simulation.camera_paths import FPS, HANDLING, film_room
 from bodyslam_jax.simulation.gait_synthesis import Soles

@@ -17,7 +17,7 @@ from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import ContactTraining, GraphWeights
 from bodyslam_jax.evaluation.plausibility import posture_figures
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.geometry.stances import find_stances
+from bodyslam_jax.ground.stances import find_stances
 from bodyslam_jax.initialisation import mean_up
 from bodyslam_jax.motion.contact_network import windows_within
 from bodyslam_jax.motion.training.contact import standing_points

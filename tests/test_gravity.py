@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.geometry.gravity import find_upright
-from bodyslam_jax.geometry.ground_slope import feet_plane, map_plane
-from bodyslam_jax.geometry.stances import find_stances, standing_feet
-from bodyslam_jax.geometry.vertical_edges import Vertical
+from bodyslam_jax.ground.gravity import find_upright
+from bodyslam_jax.ground.plane import feet_plane, map_plane
+from bodyslam_jax.ground.stances import find_stances, standing_feet
+from bodyslam_jax.ground.vertical_edges import Vertical
 
 FPS = 30.0
 NOTHING = np.zeros((0, 3))

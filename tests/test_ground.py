@@ -13,7 +13,7 @@ from bodyslam_jax import diagnostics, graph, initialisation, motion, simulation
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config, GraphWeights, Simulation
 from bodyslam_jax.diagnostics import scale_uncertainty
-from bodyslam_jax.geometry.ground_plane import find_ground
+from bodyslam_jax.ground.plane import find_ground
 from bodyslam_jax.pipeline.to_metric import to_metric
 from bodyslam_jax.types import Result, ScaleStart
 

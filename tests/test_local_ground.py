@@ -10,7 +10,7 @@ import scenes
 
 from bodyslam_jax import graph, initialisation, motion
 from bodyslam_jax.config import GraphWeights
-from bodyslam_jax.geometry.local_ground import (
+from bodyslam_jax.ground.heights import (
     elevation,
     ground_under,
     running_median,

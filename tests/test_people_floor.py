@@ -12,7 +12,7 @@ from bodyslam_jax.body import load_body_model, local_keypoints
 from bodyslam_jax.body.skeleton import BODY25_TOES_AND_HEELS
 from bodyslam_jax.config import Config, GraphWeights, Simulation
 from bodyslam_jax.diagnostics.figures import floors_apart
-from bodyslam_jax.geometry.stances import in_free_fall
+from bodyslam_jax.ground.stances import in_free_fall
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.pipeline.motion_prediction import (
     contact_predictor,

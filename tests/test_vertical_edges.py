@@ -8,7 +8,7 @@ import pytest
 
 from bodyslam_jax import sfm
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.geometry.vertical_edges import Edges, find_vertical, make_edges
+from bodyslam_jax.ground.vertical_edges import Edges, find_vertical, make_edges
 from bodyslam_jax.types import Intrinsics, Keypoints, Sequence
 
 FOCAL, WIDTH, HEIGHT = 600.0, 960, 540

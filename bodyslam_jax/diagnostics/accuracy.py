@@ -16,7 +16,7 @@ from jaxtyping import Float
 from bodyslam_jax.config import Structure
 from bodyslam_jax.diagnostics.statistics import smoothed
 from bodyslam_jax.geometry.arrays import runs
-from bodyslam_jax.geometry.gravity import Upright
+from bodyslam_jax.ground.gravity import Upright
 from bodyslam_jax.types import Result, Sequence, SfmResult
 
 _MIN_REPORTED_FOCAL_SIGMA = 0.05

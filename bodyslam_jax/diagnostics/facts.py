@@ -9,7 +9,7 @@ the two is wrong, and which one cannot be told from here.
 |---|---|
 | stature | the posterior less the fact (`people.stature_without`) |
 | focal length, principal point | self-calibration from the tracks |
-| gravity | trunks, ground and edges (`geometry.levelling`) |
+| gravity | trunks, ground and edges (`ground.gravity`) |
 | static camera | motion of the background's points |
 | camera path in metres | people's steps and the ground under their feet |
 | frame rate | the walk ratio of people's gait |
@@ -27,7 +27,7 @@ import numpy as np
 from bodyslam_jax.config import FOCAL_SIGMA, GRAVITY_SIGMA, Known
 from bodyslam_jax.diagnostics.checks import Reason
 from bodyslam_jax.diagnostics.gait import WALK_RATIO_SPREAD, Gait
-from bodyslam_jax.geometry.gravity import Upright
+from bodyslam_jax.ground.gravity import Upright
 from bodyslam_jax.types import JointEstimate, Sequence, SfmResult
 
 WARNING_SIGMAS, DOUBT_SIGMAS = 2.0, 3.0

@@ -10,7 +10,7 @@ from bodyslam_jax.diagnostics.moments import MOMENT_S
 from bodyslam_jax.diagnostics.standing_height import standing_height_figures
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.arrays import runs as runs_of
-from bodyslam_jax.geometry.stances import find_stances
+from bodyslam_jax.ground.stances import find_stances
 
 _WALKING_SPEEDS_M_S = (0.7, posture.RUNNING_SPEED_M_S)
 """Range of median horizontal speeds in walking."""

@@ -12,7 +12,7 @@ from bodyslam_jax.diagnostics.reprojection import projected_keypoints
 from bodyslam_jax.diagnostics.scale_uncertainty import cue_discrepancy
 from bodyslam_jax.diagnostics.standing_height import ground_heights
 from bodyslam_jax.diagnostics.thresholds import PERSON_CHECKS, WORLD_CHECKS
-from bodyslam_jax.geometry.gravity import Upright
+from bodyslam_jax.ground.gravity import Upright
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
 _ADULT_STATURE_M = 1.7

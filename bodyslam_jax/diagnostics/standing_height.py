@@ -1,16 +1,16 @@
 """Measures how well standing feet lie on one plane, and on the map's ground below each.
 
 Feet on stairs or uneven ground are on no plane, but on the ground that the landmarks
-about each foot show (`geometry.local_ground`). Somebody who floats is on neither.
+about each foot show (`ground.heights`). Somebody who floats is on neither.
 """
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.body.skeleton import FEET
-from bodyslam_jax.geometry.ground_plane import find_ground
-from bodyslam_jax.geometry.local_ground import ground_under
-from bodyslam_jax.geometry.stances import find_stances, standing_by_speed
+from bodyslam_jax.ground.plane import find_ground
+from bodyslam_jax.ground.heights import ground_under
+from bodyslam_jax.ground.stances import find_stances, standing_by_speed
 from bodyslam_jax.types import Result
 
 _MIN_SLOPE_EXTENT_M = 1.0

@@ -40,7 +40,7 @@ from bodyslam_jax.diagnostics.statistics import (
     PathStatistics,
     camera_statistics,
 )
-from bodyslam_jax.geometry.gravity import Upright
+from bodyslam_jax.ground.gravity import Upright
 from bodyslam_jax.people.stature import SIZE_STEP, stature_range
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 

@@ -19,7 +19,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import Experiment, Simulation
 from bodyslam_jax.evaluation import Trajectories
-from bodyslam_jax.geometry.levelling import level
+from bodyslam_jax.ground.gravity import level
 from bodyslam_jax.pipeline.case import Case, trajectories
 from bodyslam_jax.pipeline.to_metric import floor_height
 

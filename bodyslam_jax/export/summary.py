@@ -10,7 +10,7 @@ from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics.accuracy import Accuracy, PersonAccuracy
 from bodyslam_jax.diagnostics.person_verdict import PersonVerdict
 from bodyslam_jax.diagnostics.verdict import Verdict
-from bodyslam_jax.geometry.gravity import Upright
+from bodyslam_jax.ground.gravity import Upright
 from bodyslam_jax.types import (
     JointEstimate,
     OwnVariable,

@@ -11,9 +11,9 @@ from bodyslam_jax import graph
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import BODY25_ANKLES_AND_FEET
 from bodyslam_jax.config import GraphWeights
-from bodyslam_jax.geometry.ground_plane import find_ground
+from bodyslam_jax.ground.plane import find_ground
 from bodyslam_jax.geometry.lengths import padded_length, put
-from bodyslam_jax.geometry.local_ground import elevation, ground_under, running_median
+from bodyslam_jax.ground.heights import elevation, ground_under, running_median
 from bodyslam_jax.types import Keypoints
 
 _MIN_CONFIDENCE = 0.2
@@ -100,7 +100,7 @@ def with_elevation(
 ) -> graph.GroundContact:
     """Returns the factor with the heights over the ground at which people stand, where
     their feet rise and sink in the course of the sequence, and with a larger sigma of
-    those people (`geometry.local_ground.elevation`). Feet in the air have no weight."""
+    those people (`ground.heights.elevation`). Feet in the air have no weight."""
     used = np.isfinite(np.asarray(contact.sigma))
     ground = np.asarray(contact.sigma)[used] / np.sqrt(used.sum())
     every, eye = scales(contact, state), heights_of_camera(contact, state)

@@ -22,7 +22,7 @@ from bodyslam_jax import graph, initialisation
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.geometry.local_ground import wander
+from bodyslam_jax.ground.heights import wander
 from bodyslam_jax.pipeline.joint_problem import Prepared
 from bodyslam_jax.pipeline.motion_prediction import (
     contact_predictor,

@@ -13,7 +13,7 @@ from bodyslam_jax import graph, initialisation, motion, people
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PATH_SIGMA, Config, Measured
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.geometry.vertical_edges import Edges
+from bodyslam_jax.ground.vertical_edges import Edges
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.pipeline.motion_prediction import (
     contact_predictor,

@@ -20,7 +20,7 @@ from bodyslam_jax.diagnostics.scale_uncertainty import (
     covariance_sigma,
     inflate_fitted_shapes,
 )
-from bodyslam_jax.geometry.vertical_edges import Edges
+from bodyslam_jax.ground.vertical_edges import Edges
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
 from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
 from bodyslam_jax.pipeline.own_terms import OwnTerms

@@ -11,7 +11,7 @@ from bodyslam_jax import graph, initialisation, motion
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
 from bodyslam_jax.geometry.lengths import padded_length, shortened
-from bodyslam_jax.geometry.stances import in_free_fall
+from bodyslam_jax.ground.stances import in_free_fall
 from bodyslam_jax.people import PersonState
 from bodyslam_jax.solver.compilation import compiled
 from bodyslam_jax.types import Sequence
@@ -61,7 +61,7 @@ def contact_probability(
 ) -> Float[np.ndarray, "h t 4"]:
     """Returns the contact probabilities of toes and heels; 0 in free fall, which
     postures alone do not distinguish from a stance
-    (`geometry.stances.in_free_fall`)."""
+    (`ground.stances.in_free_fall`)."""
     found = np.array(predict(predictor, state))
     present = np.asarray(predictor.present)
     pelvis = np.asarray(graph.world_from_root(state))[..., :3, 3]

@@ -2,7 +2,7 @@
 
 Such a camera has no map, and each person's distance follows from their size alone, so
 that people whose sizes have different errors would stand on floors of different
-heights. Here they stand on one plane: its normal comes from `geometry.gravity`, and its
+heights. Here they stand on one plane: its normal comes from `ground.gravity`, and its
 distance from the camera, `s d` with constant d, is estimated with people's sizes. The
 variable s, metres per unit of the map, is free for this, as the map has no other
 length.
@@ -20,10 +20,10 @@ from bodyslam_jax import graph, initialisation
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import GraphWeights
-from bodyslam_jax.geometry.gravity import Upright
-from bodyslam_jax.geometry.levelling import level
-from bodyslam_jax.geometry.stances import toes_standing
-from bodyslam_jax.geometry.vertical_edges import Edges
+from bodyslam_jax.ground.gravity import Upright
+from bodyslam_jax.ground.gravity import level
+from bodyslam_jax.ground.stances import toes_standing
+from bodyslam_jax.ground.vertical_edges import Edges
 from bodyslam_jax.types import Keypoints
 
 _MIN_CONTACT_PROBABILITY = 0.5

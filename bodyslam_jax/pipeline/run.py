@@ -14,7 +14,7 @@ from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.summary import summarise
 from bodyslam_jax.geometry.lengths import padded_length
-from bodyslam_jax.geometry.vertical_edges import Edges
+from bodyslam_jax.ground.vertical_edges import Edges
 from bodyslam_jax.pipeline import joint_stage, people_stage, sfm_stage
 from bodyslam_jax.pipeline.default_body import with_compatible_body
 from bodyslam_jax.pipeline.intrinsics import with_intrinsics

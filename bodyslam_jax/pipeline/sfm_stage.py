@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from bodyslam_jax import sfm
 from bodyslam_jax.config import Config
-from bodyslam_jax.geometry.vertical_edges import Edges, make_edges
+from bodyslam_jax.ground.vertical_edges import Edges, make_edges
 from bodyslam_jax.pipeline.bundle_adjustment import (
     HELD_FOCAL_SIGMA,
     adjust,

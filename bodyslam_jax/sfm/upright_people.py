@@ -9,7 +9,7 @@ people grow or shrink as they come nearer.
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax.geometry.ground_plane import find_ground
+from bodyslam_jax.ground.plane import find_ground
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.sfm import Reconstruction
 from bodyslam_jax.types import Intrinsics, Keypoints

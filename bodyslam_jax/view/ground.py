@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.geometry.camera import project
-from bodyslam_jax.geometry.stances import standing_feet
+from bodyslam_jax.ground.stances import standing_feet
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.style import PEOPLE, Image
 
@@ -75,7 +75,7 @@ class Ground:
 
 def feet_on_the_ground(result: Result) -> Bool[np.ndarray, "h t 2"]:
     """Returns, for each frame, whether each person's left and right foot is in contact
-    with the ground: the lower foot, while it is slow (`geometry.stances`)."""
+    with the ground: the lower foot, while it is slow (`ground.stances`)."""
     stands = np.zeros((*result.present.shape, 2), bool)
     for h, present in enumerate(result.present):
         for run in runs(present):

@@ -8,13 +8,15 @@ Without an accelerometer four cues determine it, each with its own error:
   Its plane is estimated twice: from the feet that stand on it, and from the map points
   that lie in one plane below the camera.
 - Walls and posts, where visible, are vertical to some tenths of a degree
-  (`geometry.vertical_edges`).
+  (`ground.vertical_edges`).
 
 The two planes are fused by their covariances; then the plane's normal, the trunks' mean
 and the vertical of edges are combined. Each can be an outlier: on a hill, where
 postures are wrong, or where edges agree that are not vertical. So the error of each is
 a mixture of a narrow and a wide normal distribution, and the result is the posterior
 mean over all combinations.
+
+`level` aligns the y axis of the world with it.
 
 Angles are small: a direction is given by its *tilt*, x/y and z/y in a frame whose y
 axis is nearly up.
@@ -28,15 +30,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.config import GRAVITY_SIGMA
-from bodyslam_jax.geometry.ground_slope import (
+from bodyslam_jax.ground.plane import (
     CAUCHY_SCALE,
     Plane,
     feet_plane,
     fused,
     map_plane,
 )
-from bodyslam_jax.geometry.stances import find_stances
-from bodyslam_jax.geometry.vertical_edges import Vertical
+from bodyslam_jax.ground.stances import find_stances
+from bodyslam_jax.ground.vertical_edges import Edges, Vertical, find_vertical
 
 _DEGREE = np.pi / 180
 _TRUNK_SIGMA_ACROSS_RAD = 2.0 * _DEGREE
@@ -351,3 +353,83 @@ def _combined(
 def _largest(covariance: Float[np.ndarray, "2 2"]) -> float:
     """Returns the largest standard deviation in any direction."""
     return float(np.sqrt(np.linalg.eigvalsh(covariance).max()))
+
+
+def level(
+    T_WC: Float[np.ndarray, "t 4 4"],
+    T_WH: Float[np.ndarray, "h t 4 4"],
+    feet: Float[np.ndarray, "h t 2 3"],
+    present: Bool[np.ndarray, "h t"],
+    landmarks: Float[np.ndarray, "l 3"],
+    fps: float,
+    fitted: Bool[np.ndarray, " h"],
+    gravity: tuple[float, ...] = (),
+    standing: Bool[np.ndarray, "h t 2"] | None = None,
+    edges: Edges | None = None,
+    on_floor: Bool[np.ndarray, " h"] | None = None,
+) -> tuple[Float[np.ndarray, "4 4"], Upright]:
+    """Returns the rigid motion to a world whose y axis is up, and the estimate of up.
+
+    Cues (see `find_upright`) are evaluated in a roughly upright world, whose y axis is
+    opposite to `gravity` (in the first camera's axes) if that is measured, else the
+    mean direction of people's trunks, or, without people, the first camera's -y.
+    `up` and `normal` of the returned `Upright` are in the given world. Where gravity is
+    measured, up is estimated a second time without it, for comparison.
+
+    Args:
+        T_WC, T_WH: poses of the camera and of people's roots, m.
+        feet: toe joints in the world, m.
+        gravity: direction of gravity in the first camera's axes; empty if not measured.
+        landmarks, fitted, standing, edges, on_floor: see `find_upright`.
+    """
+    up = -T_WC[0, :3, 1]
+    if gravity:
+        up = -T_WC[0, :3, :3] @ np.asarray(gravity, float)
+    elif present.any():
+        up = T_WH[present][:, :3, 1].sum(axis=0)
+    rough = upright(T_WC, up / np.linalg.norm(up))
+    turn = rough[:3, :3]
+    at = lambda points: points @ turn.T + rough[:3, 3]
+    found = find_upright(
+        T_WH[..., :3, 1] @ turn.T,
+        at(feet),
+        present,
+        at(T_WC[:, :3, 3]),
+        at(landmarks),
+        fps,
+        fitted,
+        np.array([0.0, 1.0, 0.0]) if gravity else None,
+        standing,
+        None if edges is None else find_vertical(edges.rotated(turn)),
+        on_floor,
+    )
+    whole = upright(rough @ T_WC, found.up) @ rough
+    found = dataclasses.replace(
+        found, up=turn.T @ found.up, normal=turn.T @ found.normal
+    )
+    if gravity:
+        rest = (standing, edges, on_floor)
+        _, unaided = level(T_WC, T_WH, feet, present, landmarks, fps, fitted, (), *rest)
+        cosine = float(np.clip(unaided.up @ turn[1], -1, 1))
+        found = dataclasses.replace(
+            found,
+            unaided=float(np.arccos(cosine)),
+            unaided_sigma=unaided.sigma_if_sloping,
+        )
+    return whole, found
+
+
+def upright(
+    T_WC: Float[np.ndarray, "t 4 4"], up: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "4 4"]:
+    """Returns the rigid motion to a world whose origin is the first camera, with y
+    along the unit vector `up` and z horizontal in the camera's viewing direction."""
+    y = up
+    ahead = T_WC[0, :3, 2] - y * (y @ T_WC[0, :3, 2])
+    if np.linalg.norm(ahead) < 1e-3:  # The camera looks straight up or down.
+        ahead = T_WC[0, :3, 1] - y * (y @ T_WC[0, :3, 1])
+    z = ahead / np.linalg.norm(ahead)
+    turn = np.eye(4)
+    turn[:3, :3] = np.stack([np.cross(y, z), y, z])
+    turn[:3, 3] = -turn[:3, :3] @ T_WC[0, :3, 3]
+    return turn
