@@ -620,7 +620,7 @@ def few(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "SETTINGS", {name: ablation.SETTINGS[name]})
     monkeypatch.setattr(plans, "NOISE_LEVELS", ("low",))
     monkeypatch.setattr(plans, "LEARNING_STEPS", 3)
-    monkeypatch.setattr("bodyslam_jax.solver.schedule.PAPER_STEPS", (20, 20))
+    monkeypatch.setattr("bodyslam_jax.solver.solve.PAPER_STEPS", (20, 20))
     file = tmp_path / "own.npz"
     shutil.copy(Path(motion.__file__).parent / "assets" / "default.npz", file)
     return str(file)

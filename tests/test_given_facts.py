@@ -22,8 +22,7 @@ from bodyslam_jax.diagnostics.facts import (
     misfits_of_own_factors,
 )
 from bodyslam_jax.diagnostics.statistics import stature
-from bodyslam_jax.ground.gravity import Upright
-from bodyslam_jax.ground.gravity import level
+from bodyslam_jax.ground.gravity import Upright, level
 from bodyslam_jax.io.camera.calibration import read_camera
 from bodyslam_jax.io.camera.recognise import recognised
 from bodyslam_jax.pipeline import sfm_stage

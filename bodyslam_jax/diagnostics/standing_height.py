@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.body.skeleton import FEET
-from bodyslam_jax.ground.plane import find_ground
 from bodyslam_jax.ground.heights import ground_under
+from bodyslam_jax.ground.plane import find_ground
 from bodyslam_jax.ground.stances import find_stances, standing_by_speed
 from bodyslam_jax.types import Result
 

@@ -1,1 +1,1 @@
-"""Camera models, rotations, triangulation, planes and smoothing, for all stages."""
+"""Camera models, rotations, triangulation and smoothing, for all stages."""

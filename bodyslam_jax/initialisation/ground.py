@@ -11,9 +11,9 @@ from bodyslam_jax import graph
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import BODY25_ANKLES_AND_FEET
 from bodyslam_jax.config import GraphWeights
-from bodyslam_jax.ground.plane import find_ground
 from bodyslam_jax.geometry.lengths import padded_length, put
 from bodyslam_jax.ground.heights import elevation, ground_under, running_median
+from bodyslam_jax.ground.plane import find_ground
 from bodyslam_jax.types import Keypoints
 
 _MIN_CONFIDENCE = 0.2

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from bodyslam_jax.body import BodyModel, local_joints
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.ground.gravity import upright
 from bodyslam_jax.graph import CHUNK
+from bodyslam_jax.ground.gravity import upright
 from bodyslam_jax.online.window import Solved
 from bodyslam_jax.pipeline.to_metric import sole_height
 

@@ -20,8 +20,7 @@ from bodyslam_jax import graph, initialisation
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import GraphWeights
-from bodyslam_jax.ground.gravity import Upright
-from bodyslam_jax.ground.gravity import level
+from bodyslam_jax.ground.gravity import Upright, level
 from bodyslam_jax.ground.stances import toes_standing
 from bodyslam_jax.ground.vertical_edges import Edges
 from bodyslam_jax.types import Keypoints

@@ -10,12 +10,11 @@ from bodyslam_jax import people
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import Config
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.ground.gravity import Upright
 from bodyslam_jax.geometry.lengths import lengthened, padded_length
-from bodyslam_jax.ground.gravity import level
+from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
+from bodyslam_jax.ground.gravity import Upright, level
 from bodyslam_jax.ground.stances import find_stances, toes_standing
 from bodyslam_jax.ground.vertical_edges import Edges
-from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
 
