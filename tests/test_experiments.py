@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import importlib
 import json
 import math
 import shutil
@@ -620,7 +621,9 @@ def few(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "SETTINGS", {name: ablation.SETTINGS[name]})
     monkeypatch.setattr(plans, "NOISE_LEVELS", ("low",))
     monkeypatch.setattr(plans, "LEARNING_STEPS", 3)
-    monkeypatch.setattr("bodyslam_jax.solver.solve.PAPER_STEPS", (20, 20))
+    # The package exports the function of this module's name.
+    solve = importlib.import_module("bodyslam_jax.solver.solve")
+    monkeypatch.setattr(solve, "PAPER_STEPS", (20, 20))
     file = tmp_path / "own.npz"
     shutil.copy(Path(motion.__file__).parent / "assets" / "default.npz", file)
     return str(file)
