@@ -127,6 +127,35 @@ def test_a_camera_that_moves_begins_a_map_within_two_seconds(factor):
         assert any(begun)
 
 
+def towards(way: float, frames: int):
+    """Pixels, with noise of 0.5 px, of points in front of a camera that moves along its
+    view (m a frame): three quarters of them 15 to 60 m away, the others 4 to 8 m."""
+    rng = np.random.default_rng(2)
+    depth = np.concatenate([rng.uniform(15, 60, 240), rng.uniform(4, 8, 80)])
+    rays = rng.uniform([-0.5, -0.4], [0.5, 0.4], (320, 2))
+    points = depth[:, None] * np.column_stack([rays, np.ones(320)])
+    for k in range(frames):
+        p_C = points - [0, 0, way * k]
+        uv = project_points(CAMERA, p_C) + 0.5 * rng.standard_normal((320, 2))
+        inside = (p_C[:, 2] > 0.5) & (uv > 0).all(1) & (uv < [640, 480]).all(1)
+        yield np.flatnonzero(inside), uv[inside]
+
+
+def test_a_camera_that_moves_along_its_view_is_told_from_one_that_turns():
+    """Its points have little parallax however far it goes: a map begins with those that
+    have some, once it is known that no other ones come."""
+    scene = off_by(0.9)
+    views = list(towards(0.02, 110))
+    for ids, uv in views[:100]:
+        assert scene.begin(ids, uv) is None
+    assert scene.moving
+    scene.forwards = True
+    poses = next(found for v in views[100:] if (found := scene.begin(*v)) is not None)
+    way = np.array([pose[:3, 3] for pose in poses if pose is not None])
+    assert len(way) > 90
+    assert (way[-1] - way[0])[2] > 5 * np.abs((way[-1] - way[0])[:2]).max()
+
+
 def test_a_rotation_tells_the_focal_length_that_explains_it():
     views = list(around(0.012, 0.0, 40))
     (ids_a, a), (ids_b, b) = views[0], views[-1]
