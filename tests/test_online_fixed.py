@@ -24,13 +24,15 @@ CAMERA = Intrinsics(np.array([525.0, 525.0, 319.5, 239.5]), 640, 480)
 FPS = 30.0
 
 
-def seen_by(T_WC: np.ndarray, seed: int = 0):
-    """Pixels of 300 points, with noise of 0.5 px, in each frame."""
+def seen_by(T_WC: np.ndarray, seed: int = 0, points: np.ndarray | None = None):
+    """Pixels of points (300 at 3 to 8 m without them), with noise of 0.5 px, in each
+    frame."""
     rng = np.random.default_rng(seed)
-    points = rng.uniform([-6, -2, 3], [6, 2, 8], (300, 3))
+    if points is None:
+        points = rng.uniform([-6, -2, 3], [6, 2, 8], (300, 3))
     for T in T_WC:
         p_C = (points - T[:3, 3]) @ T[:3, :3]
-        uv = project_points(CAMERA, p_C) + 0.5 * rng.standard_normal((300, 2))
+        uv = project_points(CAMERA, p_C) + 0.5 * rng.standard_normal((len(points), 2))
         inside = (p_C[:, 2] > 0.5) & (uv > 0).all(1) & (uv < [640, 480]).all(1)
         yield np.flatnonzero(inside), uv[inside]
 
@@ -99,9 +101,11 @@ def without_solves(monkeypatch):
     monkeypatch.setattr(online, "compile_all", lambda *a, **b: None)
 
 
-def play(one: bs.Online, T_WC: np.ndarray, seed: int = 0) -> list:
+def play(
+    one: bs.Online, T_WC: np.ndarray, seed: int = 0, points: np.ndarray | None = None
+) -> list:
     nobody = np.zeros((0, 25, 3))
-    rows = enumerate(seen_by(T_WC, seed))
+    rows = enumerate(seen_by(T_WC, seed, points))
     return [one.update(None, k / FPS, nobody, points=points) for k, points in rows]
 
 
@@ -123,6 +127,25 @@ def test_a_camera_without_parallax_for_three_seconds_is_fixed(without_solves):
     assert result.summary["camera_motion"] == "static"
     assert np.abs(result.T_WC - result.T_WC[0]).max() < 1e-12
     assert any("stand still" in line for line in result.summary["warnings"])
+
+
+def test_a_camera_that_moves_along_its_view_is_not_taken_to_stand_still(without_solves):
+    """Three quarters of its points are 15 to 60 m away, and have little parallax."""
+    rng = np.random.default_rng(2)
+    depth = np.concatenate([rng.uniform(15, 60, 240), rng.uniform(4, 8, 80)])
+    rays = rng.uniform([-0.5, -0.4], [0.5, 0.4], (320, 2))
+    points = depth[:, None] * np.column_stack([rays, np.ones(320)])
+    ahead = path(130)
+    ahead[:, 2, 3] = 0.02 * np.arange(130)
+    one = started()
+    found = play(one, ahead, points=points)
+    states = [e.status for e in found]
+    assert "fixed" not in states and states[-1] == "tracking"
+    begun = states.index("tracking")
+    assert found[begun].timestamp >= maps.MAX_START_S
+    assert maps.LITTLE_PARALLAX in found[begun - 1].notes
+    assert maps.LITTLE_PARALLAX not in found[-1].notes
+    assert one.finish().summary["camera_motion"] == "moving"
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.9])
