@@ -6,6 +6,8 @@ iteration of a solve in which people alone determine the scale (appendix D).
 """
 
 import dataclasses
+import functools
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -51,20 +53,29 @@ class ScaleRecovery:
         return float(np.ptp(answer) / answer.mean())
 
 
-def scale_recovery(case: Case) -> ScaleRecovery:
+def scale_recovery(
+    case: Case,
+    perturbations: Sequence[float] = PERTURBATIONS,
+    *,
+    schedule: tuple[solver.Stage, ...] = SCHEDULE,
+    prepared: tuple[graph.Problem, graph.State] | None = None,
+) -> ScaleRecovery:
     """Estimates s, starting at 1, for cameras of the true size that are scaled by `1/p`
-    and held.
+    and held, for each `p` of `perturbations`.
 
     Only s and people are free, without landmarks. All perturbations are one solve that
     is mapped over start states and distributed over JAX's devices. The cameras are
     those of the pipeline (the paper uses motion capture), aligned to their true size by
-    Sim(3).
+    Sim(3). `prepared` gives the problem and its first state, for a caller who has them
+    from `without_map` already.
     """
-    found = case.prepare()
-    problem, state = without_map(found.problem, found.state, hold_cameras=True)
+    if prepared is None:
+        found = case.prepare()
+        prepared = without_map(found.problem, found.state, hold_cameras=True)
+    problem, state = prepared
     true_size = graph.rescaled(problem, with_scale(state, 1.0), case.map_scale)
-    state, history = _recover(
-        jnp.asarray(PERTURBATIONS),
+    state, history = _recover(schedule)(
+        jnp.asarray(perturbations),
         *true_size,
         case.truth,
         case.body,
@@ -72,23 +83,29 @@ def scale_recovery(case: Case) -> ScaleRecovery:
         jnp.asarray(case.cameras.registered),
     )
     return ScaleRecovery(
-        perturbation=np.array(PERTURBATIONS),
+        perturbation=np.array(perturbations),
         scale=np.asarray(state.scale),
         history=np.asarray(history["scale"]),
         h_ate=np.asarray(history["h_ate"]),
     )
 
 
-def _recover_one(perturbation, problem, state, truth, body, present, registered):
+@functools.cache
+def _recover(schedule):
+    """Returns one function per schedule, which compiles once for cases of one size."""
+    one = functools.partial(_recover_one, schedule=schedule)
+    return solver.vmap_over_devices(one, (0, *(None,) * 6))
+
+
+def _recover_one(
+    perturbation, problem, state, truth, body, present, registered, *, schedule
+):
     start = graph.rescaled(problem, state, 1 / perturbation)
     observe = lambda y: {
         "scale": y.scale,
         "h_ate": _h_ate(y, truth, body, present, registered),
     }
-    return solver.trace(*start, observe, schedule=SCHEDULE)
-
-
-_recover = solver.vmap_over_devices(_recover_one, (0, *(None,) * 6))
+    return solver.trace(*start, observe, schedule=schedule)
 
 
 def _h_ate(state, truth: Trajectories, body, present, registered):
