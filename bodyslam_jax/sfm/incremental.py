@@ -6,7 +6,7 @@ between. Keyframes are located first, then the frames between them.
 """
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -28,53 +28,6 @@ cameras cannot be located."""
 _MIN_PLANAR_SHARE = 0.9
 """Least share of a pair's inliers that a plane explains, for its two poses to be tried:
 a plane with the outliers that tracks have."""
-MIN_RELIABLE_POINTS, _NEIGHBOUR_KEYFRAMES = 25, 10
-"""Number of points below which a camera is located poorly; number of keyframes before
-and after it in which two candidate maps are compared."""
-
-
-def build_map(
-    make: Callable[[], "Builder"], keyframes: np.ndarray, pairs: np.ndarray
-) -> tuple["Builder", PartialMap] | None:
-    """Returns the map that grows best over the keyframes of one shot.
-
-    Where few points are visible, translation along a plane may be mistaken for a
-    rotation: a map that grows across such a section bends, and bundle adjustment does
-    not recover it. Growing from the other side may succeed. So both are tried, and the
-    map with more inliers around the section is kept, unless it loses cameras.
-
-    Args:
-        make: returns a new builder.
-        pairs: frames, error of a turning camera and common points of each pair of
-            keyframes, as from `rotation_error`.
-    """
-    builder = make()
-    grown = builder.build(keyframes, first_pairs(pairs, _NUM_FIRST_PAIRS))
-    if grown is None:
-        return None
-    best = builder, grown
-    if builder.thin:
-        thinnest = min(builder.thin, key=lambda k: (builder.thin[k], k))
-        before, after = pairs[:, :2] < thinnest, pairs[:, :2] > thinnest
-        beyond = before if builder.origin > thinnest else after
-        other = make()
-        starts = first_pairs(pairs[beyond.all(axis=1)], _NUM_FIRST_PAIRS)
-        again = other.build(keyframes, starts)
-        located = lambda growing: np.count_nonzero(growing.registered[keyframes])
-        if (
-            again is not None
-            and other.threshold <= builder.threshold
-            and located(again) >= located(grown)
-        ):
-            at = np.searchsorted(keyframes, sorted(builder.thin | other.thin))
-            away = np.abs(np.arange(len(keyframes))[:, None] - at).min(axis=1)
-            near = keyframes[away <= _NEIGHBOUR_KEYFRAMES]
-            scores = builder.score(grown, near), other.score(again, near)
-            _log.debug("around frame %d: %.3f, and %.3f from beyond", thinnest, *scores)
-            if scores[1] > scores[0]:
-                best = other, again
-    best[0].finish(best[1], keyframes)
-    return best
 
 
 def first_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
@@ -102,11 +55,6 @@ def first_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
 class Builder(Mapper):
     """Grows a reconstruction over the keyframes of one shot."""
 
-    origin = 0
-    """Frame that the map grew from."""
-    thin: dict[int, int]
-    """Number of points of each keyframe that was located by few."""
-
     def begin(self, path: CameraPath) -> PartialMap:
         """Returns the map triangulated from cameras of known poses, which are held."""
         R_WC, centre = path.T_WC[:, :3, :3], path.T_WC[:, :3, 3]
@@ -121,26 +69,31 @@ class Builder(Mapper):
             np.zeros(self.num_landmarks, dtype=bool),
             np.zeros(len(self.views.frame), dtype=bool),
             np.arange(self.num_landmarks),
+            origin=int(np.argmax(path.known)),
         )
-        self.thin = {}
         self.make_points(grown, self._views_of(grown))
         self._mark(grown)
         return grown
 
     def build(self, keyframes: np.ndarray, pairs: np.ndarray) -> PartialMap | None:
-        """Returns the best of the maps that grow from `pairs` of keyframes.
+        """Returns the best of the maps that grow over `keyframes`, the cameras of one
+        shot, from some of `pairs`; `None` if no pair starts a map.
+
+        Args:
+            pairs: frames, error of a turning camera and common points of each pair of
+                keyframes, as from `rotation_error`.
 
         Where even the best has many outliers, the noise of the tracks is larger than
         assumed: it is tried again with twice the tolerance.
         """
-        self.thin = {}
-        best, score = self._best_start(keyframes, pairs)
+        starts = first_pairs(pairs, _NUM_FIRST_PAIRS)
+        best, score = self._best_start(keyframes, starts)
         for _ in range(2):
             if score > 0.75:
                 break
             self.threshold *= 2
             self.pixel *= 2
-            wider, wider_score = self._best_start(keyframes, pairs[:2])
+            wider, wider_score = self._best_start(keyframes, starts[:2])
             if wider_score < score + 0.1:
                 self.threshold /= 2
                 self.pixel /= 2
@@ -148,7 +101,6 @@ class Builder(Mapper):
             best, score = wider, wider_score
         if best is None:
             return None
-        self.origin, self.thin = int(np.argmax(best.registered)), {}
         self.joining = self.config.join_tracks
         self._grow(best, keyframes)
         for _ in range(_NUM_RELAXED_ROUNDS):
@@ -158,9 +110,10 @@ class Builder(Mapper):
             self.min_angle *= 0.6
             self.make_points(best, self._views_of(best))
             self._grow(best, keyframes)
+        self._finish(best, keyframes)
         return best
 
-    def finish(self, grown: PartialMap, keyframes: np.ndarray) -> None:
+    def _finish(self, grown: PartialMap, keyframes: np.ndarray) -> None:
         """Re-examines all joins and outliers with all keyframes in the map."""
         self._settle(grown, keyframes[grown.registered[keyframes]])
         for _ in range(3):  # outliers sorted anew in between
@@ -248,11 +201,12 @@ class Builder(Mapper):
             np.zeros(self.num_landmarks, dtype=bool),
             np.zeros(len(self.views.frame), dtype=bool),
             np.arange(self.num_landmarks),
+            origin=a,
         )
         self.make_points(grown, np.concatenate([at_a[good], at_b[good]]))
         if grown.has_point.sum() < MIN_SHARED_POINTS:
             return None
-        self._refine(grown, grown.registered & (np.arange(self.num_frames) != a))
+        self._refine(grown, self._free(grown))
         return grown
 
     def _grow(self, grown: PartialMap, frames: np.ndarray) -> None:
@@ -300,8 +254,6 @@ class Builder(Mapper):
         if found is None or found[2].sum() < max(8, 0.3 * len(at)):
             return False
         grown.scene.R_CW[k], grown.scene.centre[k] = found[:2]
-        if len(at) < MIN_RELIABLE_POINTS:
-            self.thin[k] = len(at)
         grown.registered[k] = True
         grown.inlier[at] = found[2]
         return True

@@ -48,6 +48,8 @@ class PartialMap:
     """Observations that fit, of those in registered frames."""
     shown: Int[np.ndarray, " l"]
     """The landmark that each track observes: its own, unless tracks were joined."""
+    origin: int
+    """Frame that the map grew from: its camera fixes the world frame."""
 
 
 class Mapper:
@@ -213,9 +215,14 @@ class Mapper:
         grown.inlier &= grown.has_point[self.views.landmark]
 
     def _free(self, grown: PartialMap) -> np.ndarray:
-        """Returns all registered cameras but the first, which fixes the world frame."""
+        """Returns all registered cameras but the one that fixes the world frame.
+
+        That must not be the newest one, whose pose is the least certain: others would
+        bend to it, and the scale of a map that grows towards earlier frames would drift
+        by several per cent a frame.
+        """
         free = grown.registered.copy()
-        free[np.argmax(free)] = False
+        free[grown.origin] = False
         return free
 
     def _nearest(self, grown: PartialMap, k: int, count: int) -> np.ndarray:

@@ -25,7 +25,7 @@ from bodyslam_jax.sfm.given_path import (
     PathTest,
     what_would_fit,
 )
-from bodyslam_jax.sfm.incremental import MIN_SHARED_POINTS, Builder, build_map
+from bodyslam_jax.sfm.incremental import MIN_SHARED_POINTS, Builder
 from bodyslam_jax.sfm.partial_map import PartialMap
 from bodyslam_jax.sfm.track_splitting import information_from_other_tracks
 from bodyslam_jax.types import CameraPath, Intrinsics, Tracks
@@ -139,13 +139,9 @@ def reconstruct(
     keyframes = choose_keyframes(shot, first, last, motion, MIN_SHARED_POINTS)
     pairs = rotation_error(shot, keyframes, 1 / focal)
     away = _turning_error(pairs) * focal / MAX_ROTATION_ERROR_PX
-    built = None
-    if away > 1:
-        size = (num_frames, num_landmarks)
-        make = lambda: Builder(shot, *size, focal, config)
-        built = build_map(make, keyframes, pairs)
-    if built is not None:
-        builder, grown = built
+    builder = Builder(shot, num_frames, num_landmarks, focal, config)
+    grown = builder.build(keyframes, pairs) if away > 1 else None
+    if grown is not None:
         builder.complete(grown, np.arange(first, last + 1))
         inlier = np.zeros(len(tracks.frame), dtype=bool)
         inlier[within] = grown.inlier
