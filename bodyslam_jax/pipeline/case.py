@@ -14,7 +14,6 @@ from bodyslam_jax.body.skeleton import ANKLES_AND_FEET
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.evaluation import Trajectories
 from bodyslam_jax.pipeline import before_joint
-from bodyslam_jax.pipeline.intrinsics import with_intrinsics
 from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
 from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint
 from bodyslam_jax.types import Bodies, Result, Sequence, SfmResult
@@ -127,10 +126,10 @@ def simulate_case(
     measured = diagnostics.reconcile(simulation.as_sequence(simulated), body)
     name = f"{simulated.name}-{fingerprint(sequence)}"
     kept = Cache(None if cache is None else cache / name)
-    cameras, bodies = before_joint(measured, body, config, kept)
+    used, cameras, bodies = before_joint(measured, body, config, kept)
     return Case(
         name=simulated.name,
-        sequence=with_intrinsics(measured, cameras.intrinsics),
+        sequence=used,
         truth=truth_of(simulation.as_truth(simulated)),
         body=body,
         cameras=cameras,

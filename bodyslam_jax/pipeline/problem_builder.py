@@ -3,13 +3,12 @@
 import dataclasses
 from collections.abc import Iterable
 
-from bodyslam_jax import diagnostics, graph, people
+from bodyslam_jax import diagnostics, graph
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.pipeline import before_joint, find_people
 from bodyslam_jax.pipeline.case import Case
-from bodyslam_jax.pipeline.intrinsics import with_intrinsics
 from bodyslam_jax.pipeline.joint_problem import prepare
 from bodyslam_jax.solver.padding import stack
 from bodyslam_jax.types import Sequence
@@ -50,9 +49,7 @@ def build(
         config = config or Config()
         body = load_body_model(config.body_model)
         source = diagnostics.reconcile(find_people(source, config), body)
-        cameras, bodies = before_joint(source, body, config)
-        sequence = people.select_people(source, config.person)
-        sequence = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
+        sequence, cameras, bodies = before_joint(source, body, config)
     prepared = prepare(sequence, cameras, bodies, body, config, feet=False)
     return hold_groups(prepared.problem, hold), prepared.state
 

@@ -8,11 +8,10 @@ from bodyslam_jax.config import Config
 from bodyslam_jax.evaluation import before_after
 from bodyslam_jax.export.summary import describe
 from bodyslam_jax.io.budget import granted
-from bodyslam_jax.pipeline.default_body import with_compatible_body
 from bodyslam_jax.pipeline.people_stage import check_people, with_warnings
 from bodyslam_jax.pipeline.pictures import check_overlay, write_pictures
 from bodyslam_jax.pipeline.progress import Stopwatch
-from bodyslam_jax.pipeline.run import run_stages
+from bodyslam_jax.pipeline.run import run_stages, with_compatible_body
 from bodyslam_jax.pipeline.stage_cache import Cache
 from bodyslam_jax.types import Result, Sequence
 
