@@ -26,11 +26,11 @@ from bodyslam_jax.body.skeleton import ANKLES_AND_FEET
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.pipeline import before_joint, joint_stage
 from bodyslam_jax.pipeline.case import Case, truth_of
+from bodyslam_jax.pipeline.joint_problem import solve_stage
 from bodyslam_jax.pipeline.joint_stage import with_ground_of
-from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.pipeline.to_metric import to_metric
 from bodyslam_jax.simulation import sequences
-from bodyslam_jax.simulation.terrain import TILE_LENGTH_M, Height, Terrain, lifted
+from bodyslam_jax.simulation.room import TILE_LENGTH_M, Height, Terrain, lifted
 
 UP = np.array([0.0, 1.0, 0.0])
 RISER = 0.17

@@ -18,9 +18,8 @@ from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics.statistics import camera_statistics
 from bodyslam_jax.pipeline import before_joint, joint_stage, people_stage
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
-from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
+from bodyslam_jax.pipeline.joint_problem import Prepared, prepare, schedule_of
 from bodyslam_jax.pipeline.progress import Stopwatch
-from bodyslam_jax.pipeline.solve_stage import schedule_of
 from bodyslam_jax.pipeline.stage_cache import Cache
 from bodyslam_jax.pipeline.to_metric import to_metric
 from bodyslam_jax.types import Result, SfmResult

@@ -25,7 +25,7 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.summary import summarise
 from bodyslam_jax.ground.vertical_edges import Edges, make_edges
 from bodyslam_jax.pipeline import joint_stage, people_stage, sfm_stage
-from bodyslam_jax.pipeline.own_terms import Factors, OwnTerms
+from bodyslam_jax.pipeline.joint_stage import Factors, OwnTerms
 from bodyslam_jax.pipeline.people_stage import with_warnings
 from bodyslam_jax.pipeline.progress import Stopwatch, compiling
 from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
