@@ -79,7 +79,7 @@ class GravityCues:
     accelerometer, in one world frame."""
 
     trunks: Float[np.ndarray, "h t 3"]
-    """y axes of the people's root frames, unit vectors."""
+    """Directions in which trunks point, unit vectors: y axes of the root frames."""
     feet: Float[np.ndarray, "h t 2 3"]
     """Toe joints, m."""
     present: Bool[np.ndarray, "h t"]
