@@ -21,10 +21,8 @@ from bodyslam_jax.config import Config, GraphWeights, Simulation
 from bodyslam_jax.pipeline import before_joint
 from bodyslam_jax.pipeline.case import Case, truth_of
 from bodyslam_jax.pipeline.contact_stage import Standing, hold_standing_feet
-from bodyslam_jax.pipeline.intrinsics import with_intrinsics
-from bodyslam_jax.pipeline.joint_problem import Prepared
+from bodyslam_jax.pipeline.joint_problem import Prepared, solve_stage
 from bodyslam_jax.pipeline.joint_stage import Uncertainty, of_state
-from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.pipeline.to_metric import to_metric
 
 MILLIMETRES = ("c_ate_se3", "h_ate_se3", "h_ate_sim3", "j_ate_se3", "pa_mpjpe")
@@ -41,8 +39,7 @@ def make_case(name: str, frames: int, keypoints: bool) -> Case:
     if keypoints:
         measured = dataclasses.replace(measured, bodies=None)
     measured = diagnostics.reconcile(measured, body)
-    cameras, bodies = before_joint(measured, body, config)
-    measured = with_intrinsics(measured, cameras.intrinsics)
+    measured, cameras, bodies = before_joint(measured, body, config)
     truth = truth_of(simulation.as_truth(simulated))
     return Case(name, measured, truth, body, cameras, bodies, config)
 

@@ -49,7 +49,9 @@ def extended(sequence: Sequence, num: int, folder: Path) -> Sequence:
     size = (sequence.intrinsics.width, sequence.intrinsics.height)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
     for k in order:
-        writer.write(cv2.imdecode(images[k], cv2.IMREAD_COLOR))
+        image = cv2.imdecode(images[k], cv2.IMREAD_COLOR)
+        assert image is not None
+        writer.write(image)
     writer.release()
     seen = sequence.keypoints
     if seen is not None:

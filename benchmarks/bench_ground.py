@@ -26,12 +26,11 @@ from bodyslam_jax.body.skeleton import ANKLES_AND_FEET
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.pipeline import before_joint, joint_stage
 from bodyslam_jax.pipeline.case import Case, truth_of
-from bodyslam_jax.pipeline.intrinsics import with_intrinsics
+from bodyslam_jax.pipeline.joint_problem import solve_stage
 from bodyslam_jax.pipeline.joint_stage import with_ground_of
-from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.pipeline.to_metric import to_metric
 from bodyslam_jax.simulation import sequences
-from bodyslam_jax.simulation.terrain import TILE_LENGTH_M, Height, Terrain, lifted
+from bodyslam_jax.simulation.room import TILE_LENGTH_M, Height, Terrain, lifted
 
 UP = np.array([0.0, 1.0, 0.0])
 RISER = 0.17
@@ -68,8 +67,7 @@ def make_case(name: str, floor: str, frames: int) -> Case:
         tuple(np.random.default_rng(flat.seed).spawn(3)),  # pyright: ignore
     )
     measured = diagnostics.reconcile(simulation.as_sequence(simulated), body)
-    cameras, bodies = before_joint(measured, body, config)
-    measured = with_intrinsics(measured, cameras.intrinsics)
+    measured, cameras, bodies = before_joint(measured, body, config)
     truth = truth_of(simulation.as_truth(simulated))
     return Case(f"{name}-{floor}", measured, truth, body, cameras, bodies, config)
 

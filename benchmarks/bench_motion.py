@@ -59,6 +59,7 @@ def in_jax(rounds):
         predict,
         read_motion,
     )
+    from bodyslam_jax.motion.paper_network import PaperNetwork
     from bodyslam_jax.motion.training import sampling, train
     from bodyslam_jax.motion.training import train as training
 
@@ -73,6 +74,7 @@ def in_jax(rounds):
     body = load_body_model(dtype=jnp.float32)
     data = sampling.corpus(read_motion(WALKS), settings)
     network = training.initial_network(jax.random.key(0), settings)
+    assert isinstance(network, PaperNetwork)
     progress = training.start(network, settings)
     share = lambda rate: 6 * PRODUCTS * rate / gemm_rate
 

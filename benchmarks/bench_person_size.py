@@ -29,7 +29,7 @@ from bodyslam_jax import (
     solver,
 )
 from bodyslam_jax.config import Config, GraphWeights, PeopleFit, Simulation
-from bodyslam_jax.pipeline.solve_stage import solve_stage
+from bodyslam_jax.pipeline.joint_problem import solve_stage
 
 MUTED = graph.RootSmoothness
 """Its weight is of the person's path in the world."""

@@ -216,7 +216,7 @@ def _write(film: Film, path: Path) -> Keypoints:
         q = (grid - centre) / focal / size / _stretch(film.aspect)
         q = _undistorted(q, film.k1)
         at = (q * focal + params[2:4]).astype(np.float32)
-        writer.write(cv2.remap(image, at, None, cv2.INTER_CUBIC))
+        writer.write(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC))
     writer.release()
     walker = scene.actors[0]
     G, joints = walker.person.joints(walker.walk.poses, walker.walk.pelvis)

@@ -300,7 +300,7 @@ def clip_row(video: Path) -> Row:
     from bodyslam_jax import io, pipeline
     from bodyslam_jax.body.skeleton import NECK, PELVIS
     from bodyslam_jax.config import Config
-    from bodyslam_jax.evaluation.plausibility import posture_figures
+    from bodyslam_jax.evaluation.errors import posture_figures
 
     config = Config(overlay=False)
     sequence = pipeline.find_people(io.read_sequence(video), config)

@@ -38,6 +38,7 @@ def peers(frames, names, python, repeats, rtol, steps, tracks, seed):
     """Peers and this solver, in turn, on one problem."""
     problem, _, start = make(frames, 0, seed, tracks=tracks)
     (factor,) = problem.factors
+    assert isinstance(factor, g.Reprojection)
     count = len(np.unique(factor.landmark))
     run = lambda name, factor: run_peer(name, factor, start, python, rtol, steps)
     factor = without_lost(factor, start, [n for n in names if n in BLIND], run)

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from bodyslam_jax.motion import load_motion_model as load_motion_model
     from bodyslam_jax.online import Online as Online
     from bodyslam_jax.pipeline import run as run
+    from bodyslam_jax.pipeline.case import build as build
     from bodyslam_jax.pipeline.case import simulate_case as simulate_case
-    from bodyslam_jax.pipeline.problem_builder import build as build
-    from bodyslam_jax.pipeline.problem_builder import stack_cases as stack_cases
+    from bodyslam_jax.pipeline.case import stack_cases as stack_cases
     from bodyslam_jax.solver import quick_options as quick_options
     from bodyslam_jax.solver import solve as solve
     from bodyslam_jax.solver import vmap_over_devices as vmap_over_devices
@@ -54,7 +54,7 @@ _HOME = {
     "Sequence": "types",
     "State": "graph",
     "Variable": "graph",
-    "build": "pipeline.problem_builder",
+    "build": "pipeline.case",
     "check_factor": "graph",
     "evaluate": "evaluation",
     "load_body_model": "body",
@@ -66,7 +66,7 @@ _HOME = {
     "run_many": "batch",
     "simulate_case": "pipeline.case",
     "solve": "solver",
-    "stack_cases": "pipeline.problem_builder",
+    "stack_cases": "pipeline.case",
     "stack_pairs": "evaluation",
     "vmap_over_devices": "solver",
     "weights": "graph",

@@ -24,9 +24,8 @@ from bodyslam_jax.config import (
     Simulation,
     with_options,
 )
-from bodyslam_jax.experiments.command import run_experiment
 from bodyslam_jax.experiments.jobs import Job, Plan
-from bodyslam_jax.experiments.plans import PLANS
+from bodyslam_jax.experiments.plans import PLANS, run_experiment
 
 
 class InProcess:

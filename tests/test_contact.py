@@ -15,7 +15,7 @@ import bodyslam_jax.graph as g
 from bodyslam_jax import initialisation, motion, simulate_case
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import ContactTraining, GraphWeights
-from bodyslam_jax.evaluation.plausibility import posture_figures
+from bodyslam_jax.evaluation.errors import posture_figures
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.ground.stances import find_stances
 from bodyslam_jax.initialisation import mean_up

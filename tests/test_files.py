@@ -50,7 +50,7 @@ OWN_FILES = {
     "batch/local_engine.py": "the system's own files",
     "export/report.py": "ships with the package",
     "batch/collection.py": "ships with the package",
-    "view/scene_page.py": "ships with the package, and a run's page",
+    "view/scene_data.py": "ships with the package, and a run's page",
     "motion/weights.py": "text in memory",
     "motion/contact_network.py": "text in memory",
     "batch/slurm_engine.py": "values that its own workers write",

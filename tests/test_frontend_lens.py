@@ -10,7 +10,7 @@ from test_frontend_motion import CAMERA, SIZE, camera_error, scene
 
 from bodyslam_jax import simulation
 from bodyslam_jax.config import Simulation, Structure
-from bodyslam_jax.pipeline.intrinsics import with_intrinsics
+from bodyslam_jax.pipeline.people_stage import with_intrinsics
 from bodyslam_jax.sfm import find_camera_model, reconstruct, second_motion_warning
 from bodyslam_jax.sfm.camera_model import _turning_zoom
 from bodyslam_jax.sfm.zoom import without_zoom

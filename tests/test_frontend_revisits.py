@@ -8,8 +8,7 @@ from bodyslam_jax import simulation
 from bodyslam_jax.config import Simulation, Structure
 from bodyslam_jax.sfm import information_from_other_pieces, reconstruct, split_tracks
 from bodyslam_jax.sfm.bundle import Scene, Views, errors, jacobian_of_points
-from bodyslam_jax.sfm.loop_closure import Revisits
-from bodyslam_jax.sfm.relocalise import near, relocate, with_moved
+from bodyslam_jax.sfm.loop_closure import Revisits, near, relocate, with_moved
 from bodyslam_jax.sfm.track_splitting import information_from_other_tracks
 
 # Bundle adjustment runs for longer than it compiles.

@@ -22,7 +22,7 @@ from bodyslam_jax.diagnostics.facts import (
     misfits_of_own_factors,
 )
 from bodyslam_jax.diagnostics.statistics import stature
-from bodyslam_jax.ground.gravity import Upright, level
+from bodyslam_jax.ground.gravity import GravityCues, Upright, level, measured_up
 from bodyslam_jax.io.camera.calibration import read_camera
 from bodyslam_jax.io.camera.recognise import recognised
 from bodyslam_jax.pipeline import sfm_stage
@@ -287,16 +287,17 @@ def test_gravity_is_compared_with_up_without_it(tilt):
     feet = np.repeat(T_WH[..., None, :3, 3], 2, axis=2) + [0.0, 1.0, 0.0]
     gravity = Rotation.from_euler("x", tilt, degrees=True).apply([0.0, 1.0, 0.0])
     present = np.ones((2, 90), bool)
-    _, up = level(
-        T_WC,
-        T_WH,
-        feet,
-        present,
-        np.zeros((0, 3)),
-        FPS,
-        np.zeros(2, bool),
-        tuple(gravity),
+    cues = GravityCues(
+        trunks=T_WH[..., :3, 1],
+        feet=feet,
+        present=present,
+        eyes=T_WC[:, :3, 3],
+        landmarks=np.zeros((0, 3)),
+        fps=FPS,
+        fitted=np.zeros(2, bool),
+        measured_up=measured_up(T_WC, tuple(gravity)),
     )
+    _, up = level(T_WC, cues)
     assert np.degrees(up.unaided) == pytest.approx(tilt, abs=3)
     walks = Gait(1.9, 0.8, 0.85)
     found = compared(Known(gravity=tuple(gravity)), up=up, gait=walks)

@@ -1,10 +1,12 @@
 """Up and standing feet, from made walkers whose up is known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bodyslam_jax.ground.gravity import find_upright
+from bodyslam_jax.ground.gravity import GravityCues, find_upright
 from bodyslam_jax.ground.plane import feet_plane, map_plane
 from bodyslam_jax.ground.stances import find_stances, standing_feet
 from bodyslam_jax.ground.vertical_edges import Vertical
@@ -44,7 +46,7 @@ def cues(feet, lean, landmarks=NOTHING, *, fitted=True):
     )
     eyes = np.broadcast_to([0.0, 1.5, 0.0], (t, 3))
     present = np.ones((h, t), bool)
-    return trunks, feet, present, eyes, landmarks, FPS, np.full(h, fitted)
+    return GravityCues(trunks, feet, present, eyes, landmarks, FPS, np.full(h, fitted))
 
 
 def off(up):
@@ -79,7 +81,7 @@ def test_each_stance_is_one_place():
 )
 def test_standing_feet_correct_trunks_that_all_lean(lean, left):
     """All but the share `left`; a lean across the view may be the floor's slope."""
-    found = find_upright(*cues(walker(way()), lean))
+    found = find_upright(cues(walker(way()), lean))
     assert off(found.up) < left * np.linalg.norm(lean)
     assert np.degrees(found.trunks) > (1 - left) * np.linalg.norm(lean)
     assert found.sigma < np.radians(4.5)
@@ -91,23 +93,23 @@ def test_the_ground_of_the_map_corrects_them_where_nobody_walks():
     floor = np.column_stack(
         [rng.uniform(-3, 3, 400), rng.normal(0, 0.02, 400), rng.uniform(2, 8, 400)]
     )
-    alone = find_upright(*cues(still, (5.0, 0, 0)))
+    alone = find_upright(cues(still, (5.0, 0, 0)))
     assert off(alone.up) == pytest.approx(5.0, abs=0.1)
-    found = find_upright(*cues(still, (5.0, 0, 0), floor))
+    found = find_upright(cues(still, (5.0, 0, 0), floor))
     assert off(found.up) < 1.0
     # A table top is no ground: people do not stand on it.
-    table = find_upright(*cues(still, (5.0, 0, 0), floor + [0, 0.8, 0]))
+    table = find_upright(cues(still, (5.0, 0, 0), floor + [0, 0.8, 0]))
     assert off(table.up) == pytest.approx(5.0, abs=0.1)
 
 
 def test_on_a_hill_up_stays_where_trunks_point():
     hill = lambda x, z: np.tan(np.radians(12.0)) * z
     feet = walker(way(bend=0.3), floor=hill)
-    found = find_upright(*cues(feet, (0.0, 0, 0), fitted=False))
+    found = find_upright(cues(feet, (0.0, 0, 0), fitted=False))
     assert off(found.up) < 6.0
     assert np.degrees(found.ground) > 5.0
     # Bodies that were fitted to keypoints may be what is wrong: less is sure.
-    loose = find_upright(*cues(feet, (0.0, 0, 0), fitted=True))
+    loose = find_upright(cues(feet, (0.0, 0, 0), fitted=True))
     assert loose.sigma > np.radians(2.5)
 
 
@@ -118,7 +120,7 @@ def test_the_error_that_is_claimed_holds_on_a_slope(direction, fitted):
     floors are level; what is claimed for floors that slope allows for that."""
     slope = np.tan(np.radians(4.0)) * np.array([np.cos(direction), np.sin(direction)])
     feet = walker(way(), floor=lambda x, z: slope[0] * x + slope[1] * z)
-    found = find_upright(*cues(feet, (0.0, 0, 0), fitted=fitted))
+    found = find_upright(cues(feet, (0.0, 0, 0), fitted=fitted))
     assert 1.0 < off(found.up) < 1.15 * np.degrees(found.sigma_if_sloping)
     assert found.sigma < found.sigma_if_sloping
 
@@ -133,7 +135,7 @@ def test_up_is_claimed_as_a_mixture_of_level_and_sloping_floors():
         slope = np.tan(np.radians(kind * rng.standard_normal(2)))
         feet = walker(way(120), floor=lambda x, z: slope[0] * x + slope[1] * z)
         lean = rng.standard_normal(3) * [4.5, 0.0, 2.0]
-        found = find_upright(*cues(feet, lean))
+        found = find_upright(cues(feet, lean))
         error[k], sigma[k] = off(found.up) / 2**0.5, np.degrees(found.sigma)
         steep[k], sloping[k] = found.sigma_if_sloping, found.slope_probability
     rms = lambda x: np.sqrt(np.mean(x**2))
@@ -170,7 +172,7 @@ def test_trunks_count_more_across_the_view_than_along_it():
     """The same wrong slope of the ground, once along the view and once across it."""
     along = walker(way(), floor=lambda x, z: 0.07 * z)
     across = walker(way(), floor=lambda x, z: 0.07 * x)
-    tilts = [find_upright(*cues(feet, (0.0, 0, 0))).up for feet in (along, across)]
+    tilts = [find_upright(cues(feet, (0.0, 0, 0))).up for feet in (along, across)]
     assert abs(tilts[0][2]) > abs(tilts[1][0])
 
 
@@ -181,7 +183,7 @@ def test_many_people_who_lean_alike_do_not_outvote_the_floor(count):
     feet = np.concatenate(
         [walker(way(bend=0.2) + [0.8 * h - 3.0, 0.5 * h]) for h in range(count)]
     )
-    found = find_upright(*cues(feet, [9, 0, 0]))
+    found = find_upright(cues(feet, [9, 0, 0]))
     assert off(found.up) < 3.0
     assert found.sigma < np.radians(6.0)
 
@@ -193,13 +195,13 @@ def test_people_who_sit_do_not_tilt_those_who_stand(floor):
     feet = np.concatenate(
         [walker(way(bend=0.2) + [0.8 * h - 3.0, 0.5 * h]) for h in range(7)]
     )
-    trunks, *rest = cues(feet, [0, 0, 2])
-    trunks = trunks.copy()
+    given = cues(feet, [0, 0, 2])
+    trunks = given.trunks.copy()
     for h, lean in ((5, 45.0), (6, 30.0)):
         trunks[h] = Rotation.from_rotvec(np.radians([0, 0, -lean])).apply([0, 1.0, 0])
     if not floor:
-        rest[0] = np.cumsum(np.full_like(rest[0], 0.05), axis=1)
-    found = find_upright(trunks, *rest)
+        feet = np.cumsum(np.full_like(feet, 0.05), axis=1)
+    found = find_upright(dataclasses.replace(given, trunks=trunks, feet=feet))
     assert off(found.up) < 3.0
     assert found.trunks < np.radians(3.0)
 
@@ -225,10 +227,11 @@ def test_without_people_the_ground_of_the_map_is_level():
     eyes = turn.apply(np.tile([0.0, 1.5, 0.0], (20, 1)))
     nobody = np.zeros((0, 20), bool)
     empty = np.zeros((0, 20, 3)), np.zeros((0, 20, 2, 3)), nobody, eyes
-    found = find_upright(*empty, turn.apply(floor), FPS, np.zeros(0, bool))
+    map_alone = GravityCues(*empty, turn.apply(floor), FPS, np.zeros(0, bool))
+    found = find_upright(map_alone)
     np.testing.assert_allclose(found.up, turn.apply([0.0, 1, 0]), atol=0.01)
     assert np.isnan(found.trunks)
-    found = find_upright(*empty, NOTHING, FPS, np.zeros(0, bool))
+    found = find_upright(dataclasses.replace(map_alone, landmarks=NOTHING))
     np.testing.assert_array_equal(found.up, [0.0, 1, 0])
     assert np.isinf(found.sigma)
 
@@ -238,16 +241,17 @@ def test_a_measured_gravity_holds_on_a_hill():
     hill = lambda x, z: np.tan(np.radians(12.0)) * z
     feet = walker(way(bend=0.3), floor=hill)
     given = cues(feet, (4.0, 0, 0), fitted=True)
-    found = find_upright(*given, measured_up=np.array([0.0, 1.0, 0.0]))
-    assert off(found.up) < 1.5 < off(find_upright(*given).up)
+    found = find_upright(
+        dataclasses.replace(given, measured_up=np.array([0.0, 1.0, 0.0]))
+    )
+    assert off(found.up) < 1.5 < off(find_upright(given).up)
     assert found.sigma < np.radians(1.1)
     assert np.degrees(found.ground) > 9.0
     # Alone it is as sure as it is said to be.
     nobody = np.zeros((0, 20), bool)
     empty = np.zeros((0, 20, 3)), np.zeros((0, 20, 2, 3)), nobody, np.zeros((20, 3))
-    alone = find_upright(
-        *empty, NOTHING, FPS, np.zeros(0, bool), np.array([0.1, 1.0, 0.0])
-    )
+    measured = np.array([0.1, 1.0, 0.0])
+    alone = find_upright(GravityCues(*empty, NOTHING, FPS, np.zeros(0, bool), measured))
     np.testing.assert_allclose(alone.up[:2], np.array([0.1, 1.0]) / 1.01**0.5)
     assert alone.sigma == pytest.approx(np.radians(1.0))
 
@@ -262,24 +266,24 @@ def test_walls_tell_a_hill_from_trunks_that_lean():
     """Where the ground slopes, and where nobody walks."""
     hill = lambda x, z: np.tan(np.radians(8.0)) * z
     given = cues(walker(way(bend=0.3), floor=hill), (3.0, 0, 0))
-    found = find_upright(*given, edges=vertical_edges(0.0, 0.0))
-    assert off(found.up) < 0.7 < off(find_upright(*given).up)
+    found = find_upright(given, vertical=vertical_edges(0.0, 0.0))
+    assert off(found.up) < 0.7 < off(find_upright(given).up)
     assert np.degrees(found.ground) == pytest.approx(8.0, abs=1.0)
-    assert found.sigma < find_upright(*given).sigma
+    assert found.sigma < find_upright(given).sigma
     still = cues(np.zeros((1, 90, 2, 3)) + [0.0, 0.0, 4.0], (5.0, 0, 0))
-    found = find_upright(*still, edges=vertical_edges(0.0, 0.0))
+    found = find_upright(still, vertical=vertical_edges(0.0, 0.0))
     assert off(found.up) < 0.7
     assert np.degrees(found.edges) == pytest.approx(off(found.up), abs=0.1)
 
 
 def test_edges_that_contradict_people_and_ground_are_believed_less():
     given = cues(walker(way()), (0.0, 0, 0), fitted=False)
-    found = find_upright(*given, edges=vertical_edges(12.0, 0.0))
+    found = find_upright(given, vertical=vertical_edges(12.0, 0.0))
     assert off(found.up) < 3.0
-    agreeing = find_upright(*given, edges=vertical_edges(0.0, 0.0))
+    agreeing = find_upright(given, vertical=vertical_edges(0.0, 0.0))
     assert agreeing.sigma < found.sigma
     nobody = np.zeros((0, 30, 2, 3))
-    alone = find_upright(*cues(nobody, (0.0, 0, 0)), edges=vertical_edges(2.0, 0.0))
+    alone = find_upright(cues(nobody, (0.0, 0, 0)), vertical=vertical_edges(2.0, 0.0))
     assert off(alone.up) == pytest.approx(2.0, abs=0.1)
     assert np.isfinite(alone.sigma)
 
@@ -293,7 +297,7 @@ def test_a_level_floor_outweighs_trunks_that_lean_a_little():
     path = 8.0 * np.column_stack(
         [np.sin(np.linspace(0, 6, 900)), np.cos(np.linspace(0, 6, 900))]
     )
-    found = find_upright(*cues(walker(path), (1.5, 0, 0), floor, fitted=False))
+    found = find_upright(cues(walker(path), (1.5, 0, 0), floor, fitted=False))
     assert off(found.up) < 0.2
 
 
@@ -317,11 +321,10 @@ def test_who_hardly_moves_says_little_of_the_floor_along_the_line_of_sight():
 
 def test_people_who_are_held_on_one_floor_show_how_it_lies():
     near, far = walker(way(bend=2.0)), walker(way(bend=2.0) + [0.0, 6.0])
-    trunks, _, *rest = cues(np.concatenate([near, far]), (0, 0, 0))
-    feet = np.concatenate([near, far + [0, 0.2, 0]])
+    given = cues(np.concatenate([near, far + [0, 0.2, 0]]), (0, 0, 0))
     both = np.array([True, True])
     found, free = (
-        find_upright(trunks, feet, *rest, on_floor=held) for held in (both, None)
+        find_upright(dataclasses.replace(given, on_floor=held)) for held in (both, None)
     )
     rise = lambda normal: np.degrees(np.arctan(-normal[2] / normal[1]))
     assert rise(found.normal) > 3 * abs(rise(free.normal)), (found, free)

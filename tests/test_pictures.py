@@ -11,7 +11,7 @@ import pytest
 from bodyslam_jax import view
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Config
-from bodyslam_jax.pipeline import pictures
+from bodyslam_jax.pipeline import run_folder
 from bodyslam_jax.pipeline.progress import Stopwatch
 from bodyslam_jax.types import Intrinsics, Keypoints, Sequence, SfmResult, Tracks
 
@@ -69,7 +69,7 @@ def _write(folder, measured, result, body, config):
     sequence, cameras = measured
     watch = Stopwatch()
     args = (sequence, cameras, result, body, config, watch)
-    return pictures.write_pictures(folder, *args), watch.seconds
+    return run_folder.write_pictures(folder, *args), watch.seconds
 
 
 def _frame(path):
@@ -113,7 +113,7 @@ def test_without_overlay_or_video_the_scene_is_written(
 
 def test_h264_is_checked_for_before_anything_is_computed(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    pictures.check_overlay(Config(overlay_video="mp4", overlay=False))
-    pictures.check_overlay(Config())
+    run_folder.check_overlay(Config(overlay_video="mp4", overlay=False))
+    run_folder.check_overlay(Config())
     with pytest.raises(ValueError, match="PyAV is not installed"):
-        pictures.check_overlay(Config(overlay_video="mp4"))
+        run_folder.check_overlay(Config(overlay_video="mp4"))

@@ -13,7 +13,7 @@ from bodyslam_jax.body import DEFAULT, load_body_model, write_npz
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.evaluation import before_after
 from bodyslam_jax.ground.gravity import upright
-from bodyslam_jax.pipeline.default_body import with_compatible_body
+from bodyslam_jax.pipeline.run import with_compatible_body
 
 CONTRACT = {
     "timestamps": (60,),

@@ -248,7 +248,7 @@ def test_memory_of_long_tracks_is_counted_in_every_chunk(monkeypatch):
         longest = lambda span, *_: np.argsort(-span, kind="stable")[:far]
         monkeypatch.setattr("bodyslam_jax.graph.layout.choose_long_tracks", longest)
         monkeypatch.setattr("bodyslam_jax.graph.layout._GROUP_LANDMARKS", FAR)
-        monkeypatch.setattr("bodyslam_jax.graph.sizes.SIZES", ())
+        monkeypatch.setattr("bodyslam_jax.graph.layout.SIZES", ())
         problem, _, state = problems.make(frames=43, people=0, landmarks=60, far=far)
         assert problem.layout.lasting == far
         problem, state = pad(problem, state)

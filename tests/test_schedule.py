@@ -8,7 +8,7 @@ import scenes
 
 from bodyslam_jax import graph, solver
 from bodyslam_jax.config import Config
-from bodyslam_jax.pipeline.solve_stage import solve_stage
+from bodyslam_jax.pipeline.joint_problem import solve_stage
 from bodyslam_jax.solver import PAPER_SCHEDULE, Solution, Stage
 from bodyslam_jax.solver.solve import check_names, check_schedule
 

@@ -56,7 +56,7 @@ def unpadded(step, state):
 def own_sizes(monkeypatch):
     """Has problems laid out in sizes of their own, as those are that fit in no common
     size."""
-    monkeypatch.setattr("bodyslam_jax.graph.sizes.SIZES", ())
+    monkeypatch.setattr("bodyslam_jax.graph.layout.SIZES", ())
 
 
 def out_of_time(monkeypatch):

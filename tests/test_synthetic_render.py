@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 from bodyslam_jax.body import load_body_model
-from bodyslam_jax.simulation.body_regions import PARTS, Outfit
 from bodyslam_jax.simulation.exact_scene import look_at, walk
 from bodyslam_jax.simulation.figure import Figure, dress
+from bodyslam_jax.simulation.garments import PARTS, Outfit
 from bodyslam_jax.simulation.posing import Person
-from bodyslam_jax.simulation.raster import rasterise
+from bodyslam_jax.simulation.raster import Shutter, cameras_at, rasterise
 from bodyslam_jax.simulation.renderer import Renderer, write_video
 from bodyslam_jax.simulation.room import Box, Room, furnish, landmarks_on
-from bodyslam_jax.simulation.shutter import Shutter, cameras_at
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
 SIZE = (640, 480)

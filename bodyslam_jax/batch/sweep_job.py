@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bodyslam_jax import diagnostics, evaluation, graph, io, people, solver
+from bodyslam_jax import diagnostics, evaluation, graph, io, solver
 from bodyslam_jax.batch.grid import SCALE
 from bodyslam_jax.batch.inputs import Input
 from bodyslam_jax.batch.rows import Row
@@ -18,10 +18,8 @@ from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics.statistics import camera_statistics
 from bodyslam_jax.pipeline import before_joint, joint_stage, people_stage
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
-from bodyslam_jax.pipeline.intrinsics import with_intrinsics
-from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
+from bodyslam_jax.pipeline.joint_problem import Prepared, prepare, schedule_of
 from bodyslam_jax.pipeline.progress import Stopwatch
-from bodyslam_jax.pipeline.solve_stage import schedule_of
 from bodyslam_jax.pipeline.stage_cache import Cache
 from bodyslam_jax.pipeline.to_metric import to_metric
 from bodyslam_jax.types import Result, SfmResult
@@ -118,9 +116,7 @@ def _prepared(job: SweepJob) -> tuple[Clip, SfmResult, BodyModel, Prepared]:
     cache, body = Cache(job.stages), load_body_model(config.body_model)
     clip = people_stage.detect(clip, config, cache, Stopwatch())
     clip = diagnostics.reconcile(clip, body)
-    cameras, bodies = before_joint(clip, body, config, cache)
-    clip = people.select_people(clip, config.person)
-    clip = with_intrinsics(clip, cameras.intrinsics, cameras.zoom)
+    clip, cameras, bodies = before_joint(clip, body, config, cache)
     return clip, cameras, body, prepare(clip, cameras, bodies, body, config)
 
 

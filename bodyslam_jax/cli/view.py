@@ -54,7 +54,7 @@ def _runs(run: Path, body_model: Path | None) -> list[dict[str, Any]]:
     and those of its start if the run folder has it."""
     import bodyslam_jax as bs
     from bodyslam_jax import evaluation, view
-    from bodyslam_jax.pipeline.start_of_joint import start_of_joint
+    from bodyslam_jax.pipeline.run_folder import start_of_joint
 
     result = evaluation.read_result(run)
     has_page = (run / "scene.html").exists()

@@ -12,6 +12,7 @@ from bodyslam_jax.evaluation.datasets import convert_emdb as convert_emdb
 from bodyslam_jax.evaluation.datasets import convert_rich as convert_rich
 from bodyslam_jax.evaluation.datasets import convert_tum_amass as convert_tum_amass
 from bodyslam_jax.evaluation.datasets import read_truth as read_truth
+from bodyslam_jax.evaluation.errors import FIGURES as FIGURES
 from bodyslam_jax.evaluation.errors import NOBODY as NOBODY
 from bodyslam_jax.evaluation.errors import Evaluation as Evaluation
 from bodyslam_jax.evaluation.errors import Pair as Pair
@@ -38,7 +39,6 @@ from bodyslam_jax.evaluation.metrics import (
 )
 from bodyslam_jax.evaluation.metrics import trajectory_error as trajectory_error
 from bodyslam_jax.evaluation.metrics import world_mpjpe as world_mpjpe
-from bodyslam_jax.evaluation.plausibility import FIGURES as FIGURES
 from bodyslam_jax.evaluation.readers import body_of_run as body_of_run
 from bodyslam_jax.evaluation.readers import check_body as check_body
 from bodyslam_jax.evaluation.readers import read_groundtruth as read_groundtruth

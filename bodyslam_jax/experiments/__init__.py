@@ -13,10 +13,10 @@ from bodyslam_jax.experiments.ablation import compare_orders as compare_orders
 from bodyslam_jax.experiments.ablation import landmark_ablation as landmark_ablation
 from bodyslam_jax.experiments.ablation import with_motion_model as with_motion_model
 from bodyslam_jax.experiments.ablation import with_weights as with_weights
-from bodyslam_jax.experiments.command import run_experiment as run_experiment
 from bodyslam_jax.experiments.comparison import METHODS as METHODS
 from bodyslam_jax.experiments.comparison import compare_methods as compare_methods
 from bodyslam_jax.experiments.comparison import depth_scale as depth_scale
+from bodyslam_jax.experiments.plans import run_experiment as run_experiment
 from bodyslam_jax.experiments.scale import PERTURBATIONS as PERTURBATIONS
 from bodyslam_jax.experiments.scale import ScaleRecovery as ScaleRecovery
 from bodyslam_jax.experiments.scale import scale_recovery as scale_recovery

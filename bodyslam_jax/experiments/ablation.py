@@ -26,8 +26,7 @@ from bodyslam_jax import graph, motion, solver
 from bodyslam_jax.config import Config, GraphWeights
 from bodyslam_jax.experiments.scenario import NAMES, score_of, with_scale, without_map
 from bodyslam_jax.pipeline.case import Case
-from bodyslam_jax.pipeline.joint_problem import Prepared
-from bodyslam_jax.pipeline.solve_stage import solve_stage
+from bodyslam_jax.pipeline.joint_problem import Prepared, solve_stage
 
 INDEPENDENT_ERRORS = {
     "motion_correlation": 0.0,

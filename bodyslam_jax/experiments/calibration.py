@@ -42,8 +42,7 @@ from bodyslam_jax.experiments.tables import (
 from bodyslam_jax.pipeline.stage_cache import Cache
 from bodyslam_jax.simulation import sequences
 from bodyslam_jax.simulation.posing import Person
-from bodyslam_jax.simulation.room import Room
-from bodyslam_jax.simulation.terrain import Height, Terrain, lifted
+from bodyslam_jax.simulation.room import Height, Room, Terrain, lifted
 from bodyslam_jax.types import Result
 
 COUNTS = {"bodies": 35, "keypoints": 35, "pixels": 30}

@@ -18,7 +18,7 @@ from bodyslam_jax.experiments.scenario import NAMES, score_of, with_scale, witho
 from bodyslam_jax.initialisation import first_state
 from bodyslam_jax.pipeline.case import Case, trajectories
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
-from bodyslam_jax.pipeline.solve_stage import solve_stage
+from bodyslam_jax.pipeline.joint_problem import solve_stage
 
 METHODS = {
     "no_mm": "no motion model: cameras in the map's own unit, people from keypoints",

@@ -19,7 +19,7 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import Experiment, Simulation
 from bodyslam_jax.evaluation import Trajectories
-from bodyslam_jax.ground.gravity import level
+from bodyslam_jax.ground.gravity import GravityCues, level
 from bodyslam_jax.pipeline.case import Case, trajectories
 from bodyslam_jax.pipeline.to_metric import floor_height
 
@@ -173,15 +173,16 @@ def _upright(
     if not present.any():
         return estimate
     T_WC, joints = np.asarray(estimate.T_WC), np.asarray(estimate.joints)
-    turn, _ = level(
-        T_WC,
-        np.asarray(graph.world_from_root(state)),
-        joints[:, :, FEET],
-        present,
-        np.asarray(state.scale * state.landmarks),
-        fps,
-        np.zeros(len(present), bool),
+    cues = GravityCues(
+        trunks=np.asarray(graph.world_from_root(state))[..., :3, 1],
+        feet=joints[:, :, FEET],
+        present=present,
+        eyes=T_WC[:, :3, 3],
+        landmarks=np.asarray(state.scale * state.landmarks),
+        fps=fps,
+        fitted=np.zeros(len(present), bool),
     )
+    turn, _ = level(T_WC, cues)
     at = lambda points: np.asarray(points) @ turn[:3, :3].T + turn[:3, 3]
     floor = floor_height(body, np.asarray(state.shapes), at(joints), present, fps)
     turn[1, 3] -= floor

@@ -29,7 +29,7 @@ from bodyslam_jax.experiments.jobs import COMPILATION_S, Job, Row, named
 from bodyslam_jax.experiments.scenario import leg_of, simulations
 from bodyslam_jax.pipeline.stage_cache import Cache, fingerprint
 from bodyslam_jax.simulation import OTHER, RECORDINGS, SimulatedSequence
-from bodyslam_jax.simulation.point_tracks import is_behind
+from bodyslam_jax.simulation.sensor_noise import is_behind
 from bodyslam_jax.types import Keypoints, Sequence
 
 INPUTS = ("pixels", "keypoints", "bodies")

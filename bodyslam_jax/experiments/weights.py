@@ -26,6 +26,7 @@ from bodyslam_jax.experiments.scenario import errors, without_map
 from bodyslam_jax.pipeline import stage_cache
 from bodyslam_jax.pipeline.case import Case, trajectories
 from bodyslam_jax.pipeline.joint_problem import Prepared
+from bodyslam_jax.solver.compilation import compiled
 
 log = logging.getLogger(__name__)
 WEIGHTS: dict[str, tuple[type[graph.Factor], str]] = {
@@ -165,7 +166,7 @@ def training_error(found: dict[str, Float[Array, ""]]) -> Float[Array, ""]:
     ] / JOINT_UNIT_M
 
 
-@eqx.filter_jit
+@compiled
 def error_and_gradient(
     trial: Trial, names: tuple[str, ...], log: Float[Array, " w"], state: graph.State
 ) -> tuple[Float[Array, ""], Float[Array, " w"], graph.State]:
@@ -295,7 +296,7 @@ def judge(trial: Trial, learned: Learned) -> dict[str, float]:
     return row
 
 
-@eqx.filter_jit
+@compiled
 def _errors_with(
     trial: Trial, names: tuple[str, ...], log: Float[Array, " w"]
 ) -> dict[str, Float[Array, ""]]:

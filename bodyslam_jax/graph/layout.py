@@ -4,9 +4,15 @@ Tracks are nearly contiguous in time. Frames are cut into chunks, landmarks are 
 by the chunks that observe them, and each group is a dense table of frames by landmarks
 with empty entries. The reduced camera matrix is then formed by a few matrix products,
 without a list of pairs of observations. With loop closures chunks are eliminated in
-another order than that of time (`ordering.py`). Sizes are those of `sizes.py`, so that
-videos of any length share programs; a problem that fits in none of them gets sizes of
-its own. Runs in NumPy when a problem is made.
+another order than that of time (`ordering.py`). Runs in NumPy when a problem is made.
+
+A problem is padded to the first of a few common sizes that holds it, so that videos of
+any length, and with any tracks, share programs; a problem that fits in none of them
+gets sizes of its own. All sizes of one problem follow from its number of chunks:
+frames, landmarks, observations, and the tables of landmarks. Empty rows of tables cost
+time. With people that is a tenth of an iteration, and with few landmarks it is little.
+Without people, and with many landmarks, it would be half of an iteration: such a
+problem has sizes of its own by default (`is_dense`).
 """
 
 import dataclasses
@@ -19,8 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from bodyslam_jax.geometry.lengths import put, round_up
-from bodyslam_jax.graph import sizes
+from bodyslam_jax.geometry.lengths import LENGTHS, put, round_up
 from bodyslam_jax.graph.ordering import (
     CHUNK,
     PERSON_COORDINATES,
@@ -33,6 +38,34 @@ _GROUP_LANDMARKS = 24
 """Landmarks in a group. Run time has a flat minimum between 16 and 32; a size that
 depended on the tracks would compile a program for each video."""
 _MAX_BUCKETS = 3
+CHUNK_LANDMARKS = 128
+"""Number of landmarks for each chunk of ten frames."""
+CHUNK_OBSERVATIONS = 2304
+"""Number of observations for each chunk; the front end tracks 200 points."""
+NARROW_CHUNKS, WIDE_CHUNKS = 3, 10
+"""Number of chunks that a table spans. The landmarks of the joint graph span 90 frames
+at most (`Structure.landmark_span`), which are in 10 chunks."""
+LONG_TRACK_CHUNKS = 20
+"""Number of chunks that a wide table spans for long tracks (bundle adjustment)."""
+_MAX_LONG_TRACK_CHUNKS = 40
+"""Largest number of chunks with a size for longer tracks: their covariances take memory
+in proportion to the number of chunks and the square of the bandwidth."""
+_MIN_DENSE_FRAMES, _MIN_LANDMARKS_PER_FRAME = 200, 6.4
+"""Number of frames, and landmarks for each, from which on a problem without people
+saves more in three solves with sizes of its own than their compilation takes."""
+_CHUNK_COUNTS = tuple(length // CHUNK for length in LENGTHS)
+
+
+class Size(NamedTuple):
+    """The sizes of a problem that one compiled program can hold."""
+
+    chunks: int
+    landmarks: int
+    observations: int
+    widths: tuple[int, ...]
+    """Numbers of chunks that narrow and wide tables span: the longest track."""
+    groups: tuple[int, ...]
+    """Numbers of groups of landmarks in narrow and wide tables."""
 
 
 class Bucket(eqx.Module):
@@ -129,7 +162,7 @@ def make_layout(
 def layouts_of_one_size(problems: Sequence[Tracks]) -> list[Layout] | None:
     """Returns the layouts of problems in tables of the least common size that holds
     each of them, so that all have equal shapes; `None` if there is none."""
-    for size in sizes.SIZES:
+    for size in SIZES:
         found = []
         for tracks in problems:
             layout = _in_size(size, tracks)
@@ -141,7 +174,7 @@ def layouts_of_one_size(problems: Sequence[Tracks]) -> list[Layout] | None:
     return None
 
 
-def _in_size(size: sizes.Size, tracks: Tracks) -> Layout | None:
+def _in_size(size: Size, tracks: Tracks) -> Layout | None:
     """Returns the layout in tables of a given size; `None` if it does not fit."""
     num_frames, num_landmarks, frame, landmark, front = tracks
     count = -(-num_frames // CHUNK)
@@ -351,3 +384,37 @@ def _fill(chunks, groups, width, frame, rows, begin, n=None):
     at = frame[source] - first_chunk[group][which] * CHUNK
     row[group[which], at, slot[which]] = source
     return Bucket(put(first_chunk), put(table), put(row), width)
+
+
+def is_dense(num_frames: int, num_landmarks: int, num_people: int) -> bool:
+    """Returns True if sizes of its own are faster, compilation included."""
+    many = num_landmarks > _MIN_LANDMARKS_PER_FRAME * num_frames
+    return num_people == 0 and num_frames >= _MIN_DENSE_FRAMES and many
+
+
+def _size(chunks: int, narrow: int, wide: int) -> Size:
+    wide = min(wide, chunks)
+    of_narrow, of_wide = 4 * chunks + 4, -(-12 * chunks // wide) + 4
+    return Size(
+        chunks=chunks,
+        landmarks=CHUNK_LANDMARKS * chunks,
+        observations=CHUNK_OBSERVATIONS * chunks,
+        widths=(narrow, wide) if narrow < wide else (wide,),
+        groups=(of_narrow, of_wide) if narrow < wide else (of_narrow + of_wide,),
+    )
+
+
+SIZES = tuple(
+    sorted(
+        {
+            _size(n, NARROW_CHUNKS, WIDE_CHUNKS if n > WIDE_CHUNKS + 2 else n)
+            for n in _CHUNK_COUNTS
+        }
+        | {
+            _size(n, NARROW_CHUNKS + 1, LONG_TRACK_CHUNKS)
+            for n in _CHUNK_COUNTS
+            if WIDE_CHUNKS + 2 < n <= _MAX_LONG_TRACK_CHUNKS
+        }
+    )
+)
+"""All sizes, in the order in which they are tried."""

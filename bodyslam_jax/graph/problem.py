@@ -29,14 +29,15 @@ from bodyslam_jax.graph.globals import (
     vector_of,
 )
 from bodyslam_jax.graph.layout import (
+    CHUNK_LANDMARKS,
     Layout,
     Tracks,
+    is_dense,
     layouts_of_one_size,
     make_layout,
 )
 from bodyslam_jax.graph.ordering import CHUNK
 from bodyslam_jax.graph.padding import Masked, check_padding, extend
-from bodyslam_jax.graph.sizes import CHUNK_LANDMARKS, is_dense
 from bodyslam_jax.graph.state import TURNS, State, Step, gauge
 from bodyslam_jax.graph.terms import TermCosts, names_of_terms
 from bodyslam_jax.graph.validation import (
@@ -319,7 +320,7 @@ def make_problem(
     of the camera farthest from it), the intrinsics unless `free_intrinsics`, and the
     scale s if no factor depends on it. `free` replaces this mask.
 
-    `common_sizes` pads the problem to one of a few sizes (`graph/sizes.py`), whose
+    `common_sizes` pads the problem to one of a few sizes (`graph/layout.py`), whose
     compiled programs videos of other lengths share. By default (`None`) a problem
     without people that has 200 frames or more and more than six landmarks a frame is
     not padded so: it compiles a program of its own, whose steps take half the time.

@@ -74,6 +74,47 @@ to it, m."""
 
 
 @dataclasses.dataclass(frozen=True)
+class GravityCues:
+    """What determines the up direction besides edges: people, the map and an
+    accelerometer, in one world frame."""
+
+    trunks: Float[np.ndarray, "h t 3"]
+    """Directions in which trunks point, unit vectors: y axes of the root frames."""
+    feet: Float[np.ndarray, "h t 2 3"]
+    """Toe joints, m."""
+    present: Bool[np.ndarray, "h t"]
+    eyes: Float[np.ndarray, "t 3"]
+    """Centres of the camera, m."""
+    landmarks: Float[np.ndarray, "l 3"]
+    """Map points, m; empty if the camera did not move."""
+    fps: float
+    fitted: Bool[np.ndarray, " h"]
+    """True for people whose body was fitted to keypoints, not regressed."""
+    measured_up: Float[np.ndarray, " 3"] | None = None
+    """Up according to an accelerometer, with `GRAVITY_SIGMA`; `None` without one."""
+    standing: Bool[np.ndarray, "h t 2"] | None = None
+    """Toes in contact with the ground; without it, `find_stances` decides by speed."""
+    on_floor: Bool[np.ndarray, " h"] | None = None
+    """People whom an estimate constrains to one plane, so that errors of their size do
+    not put them above or below it."""
+
+    def moved(self, motion: Float[np.ndarray, "4 4"]) -> "GravityCues":
+        """Returns the cues in another world, to which the rigid `motion` maps
+        points."""
+        turn = lambda directions: directions @ motion[:3, :3].T
+        at = lambda points: turn(points) + motion[:3, 3]
+        up = self.measured_up
+        return dataclasses.replace(
+            self,
+            trunks=turn(self.trunks),
+            feet=at(self.feet),
+            eyes=at(self.eyes),
+            landmarks=at(self.landmarks),
+            measured_up=None if up is None else turn(up),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class Upright:
     """The estimated up direction, in the frame in which the cues were given."""
 
@@ -104,47 +145,23 @@ class Upright:
     defined as `sigma`."""
 
 
-def find_upright(
-    trunks: Float[np.ndarray, "h t 3"],
-    feet: Float[np.ndarray, "h t 2 3"],
-    present: Bool[np.ndarray, "h t"],
-    eyes: Float[np.ndarray, "t 3"],
-    landmarks: Float[np.ndarray, "l 3"],
-    fps: float,
-    fitted: Bool[np.ndarray, " h"],
-    measured_up: Float[np.ndarray, " 3"] | None = None,
-    standing: Bool[np.ndarray, "h t 2"] | None = None,
-    edges: Vertical | None = None,
-    on_floor: Bool[np.ndarray, " h"] | None = None,
-) -> Upright:
+def find_upright(cues: GravityCues, vertical: Vertical | None = None) -> Upright:
     """Estimates the up direction from all available cues, given in a frame whose y axis
-    is roughly up.
-
-    Args:
-        trunks: y axes of the people's root frames, unit vectors.
-        feet: toe joints, m.
-        eyes: centres of the camera, m.
-        landmarks: map points, m; empty if the camera did not move.
-        fitted: True for people whose body was fitted to keypoints, not regressed.
-        measured_up: up according to an accelerometer, with `GRAVITY_SIGMA`.
-        standing: toes that stand; without it, `find_stances` decides by speed.
-        edges: the vertical estimated from edges in the images.
-        on_floor: people whom an estimate constrains to one plane, so that errors of
-            their size do not put them above or below it.
-    """
-    trunk_tilt = _trunks(trunks, present, eyes, feet, fps, fitted)
-    stances = find_stances(feet, present, fps, standing)
+    is roughly up; `vertical` is estimated from edges in the images."""
+    present, eyes = cues.present, cues.eyes
+    trunk_tilt = _trunks(cues)
+    stances = find_stances(cues.feet, present, cues.fps, cues.standing)
     height = _height_of_camera(eyes, stances)
     size = np.full(len(stances), _RELATIVE_SIZE_SIGMA * height)
-    if on_floor is not None:
-        size = np.where(on_floor, _HELD_HEIGHT_SIGMA_M, size)
+    if cues.on_floor is not None:
+        size = np.where(cues.on_floor, _HELD_HEIGHT_SIGMA_M, size)
     planes = [feet_plane(stances, size, np.median(eyes, axis=0))]
-    planes.append(map_plane(landmarks, eyes, stances))
+    planes.append(map_plane(cues.landmarks, eyes, stances))
     ground = fused([plane for plane in planes if plane is not None])
-    worse = _TRUNK_OUTLIER_PROBABILITY[bool((fitted & present.any(axis=1)).any())]
-    if measured_up is not None:
-        trunk_tilt, worse = _with_measured(trunk_tilt, measured_up), 0.0
-    found = _combined(_tilts(trunk_tilt, worse, edges), ground)
+    worse = _TRUNK_OUTLIER_PROBABILITY[bool((cues.fitted & present.any(axis=1)).any())]
+    if cues.measured_up is not None:
+        trunk_tilt, worse = _with_measured(trunk_tilt, cues.measured_up), 0.0
+    found = _combined(_tilts(trunk_tilt, worse, vertical), ground)
     tilt, slope = found.tilt, found.slope
     return Upright(
         up=_direction(tilt),
@@ -156,7 +173,9 @@ def find_upright(
         if trunk_tilt is None
         else float(np.linalg.norm(trunk_tilt[0] - tilt)),
         ground=float(np.arctan(np.linalg.norm(slope))),
-        edges=np.nan if edges is None else float(np.linalg.norm(edges.tilt - tilt)),
+        edges=np.nan
+        if vertical is None
+        else float(np.linalg.norm(vertical.tilt - tilt)),
     )
 
 
@@ -177,24 +196,25 @@ def _with_measured(trunk_tilt, up):
     return covariance @ (trunk @ trunk_tilt[0] + weight @ tilt), covariance
 
 
-def _trunks(trunks, present, eyes, feet, fps, fitted):
+def _trunks(cues: GravityCues) -> tuple[np.ndarray, np.ndarray] | None:
     """Returns the mean direction of people's trunks as a tilt, and its covariance,
     rad²; `None` without upright people."""
+    present, fitted = cues.present, cues.fitted
     means, weights = [], []
     views, anybody_fitted = [], False
     own_share = 1 - _COMMON_TRUNK_SHARE**2
     for h in np.flatnonzero(present.any(axis=1)):
         frames = present[h]
-        own = trunks[h, frames]
+        own = cues.trunks[h, frames]
         own = own[own[:, 1] > 0.2]  # people who lie down are left out
         if not len(own):
             continue
         tilt = own[:, [0, 2]] / own[:, 1:2]
         mean = np.median(tilt, axis=0)
         # Postures are correlated in time: about one independent sample a second.
-        seconds = max(1.0, len(own) / fps)
+        seconds = max(1.0, len(own) / cues.fps)
         scatter = 1.4826 * np.median(np.abs(tilt - mean), axis=0).max()
-        view = (feet[h, frames].mean(axis=1) - eyes[frames])[:, [0, 2]]
+        view = (cues.feet[h, frames].mean(axis=1) - cues.eyes[frames])[:, [0, 2]]
         length = np.linalg.norm(view, axis=1, keepdims=True)
         view = view / np.maximum(length, 1e-9)
         along = (view[:, :, None] * view[:, None, :]).mean(axis=0)
@@ -356,60 +376,37 @@ def _largest(covariance: Float[np.ndarray, "2 2"]) -> float:
 
 
 def level(
-    T_WC: Float[np.ndarray, "t 4 4"],
-    T_WH: Float[np.ndarray, "h t 4 4"],
-    feet: Float[np.ndarray, "h t 2 3"],
-    present: Bool[np.ndarray, "h t"],
-    landmarks: Float[np.ndarray, "l 3"],
-    fps: float,
-    fitted: Bool[np.ndarray, " h"],
-    gravity: tuple[float, ...] = (),
-    standing: Bool[np.ndarray, "h t 2"] | None = None,
-    edges: Edges | None = None,
-    on_floor: Bool[np.ndarray, " h"] | None = None,
+    T_WC: Float[np.ndarray, "t 4 4"], cues: GravityCues, edges: Edges | None = None
 ) -> tuple[Float[np.ndarray, "4 4"], Upright]:
     """Returns the rigid motion to a world whose y axis is up, and the estimate of up.
 
-    Cues (see `find_upright`) are evaluated in a roughly upright world, whose y axis is
-    opposite to `gravity` (in the first camera's axes) if that is measured, else the
-    mean direction of people's trunks, or, without people, the first camera's -y.
-    `up` and `normal` of the returned `Upright` are in the given world. Where gravity is
-    measured, up is estimated a second time without it, for comparison.
+    Cues are evaluated by `find_upright` in a roughly upright world, whose y axis is up
+    as measured, if it is, else the mean direction of people's trunks, or, without
+    people, the first camera's -y. `up` and `normal` of the returned `Upright` are in
+    the given world. Where up is measured, it is estimated a second time without that,
+    for comparison.
 
     Args:
-        T_WC, T_WH: poses of the camera and of people's roots, m.
-        feet: toe joints in the world, m.
-        gravity: direction of gravity in the first camera's axes; empty if not measured.
-        landmarks, fitted, standing, edges, on_floor: see `find_upright`.
+        T_WC: poses of the camera, m.
+        cues: people, map and measured up direction, in the same world.
+        edges: straight edges in the images, in the same world.
     """
     up = -T_WC[0, :3, 1]
-    if gravity:
-        up = -T_WC[0, :3, :3] @ np.asarray(gravity, float)
-    elif present.any():
-        up = T_WH[present][:, :3, 1].sum(axis=0)
+    if cues.measured_up is not None:
+        up = cues.measured_up
+    elif cues.present.any():
+        up = cues.trunks[cues.present].sum(axis=0)
     rough = upright(T_WC, up / np.linalg.norm(up))
     turn = rough[:3, :3]
-    at = lambda points: points @ turn.T + rough[:3, 3]
-    found = find_upright(
-        T_WH[..., :3, 1] @ turn.T,
-        at(feet),
-        present,
-        at(T_WC[:, :3, 3]),
-        at(landmarks),
-        fps,
-        fitted,
-        np.array([0.0, 1.0, 0.0]) if gravity else None,
-        standing,
-        None if edges is None else find_vertical(edges.rotated(turn)),
-        on_floor,
-    )
+    vertical = None if edges is None else find_vertical(edges.rotated(turn))
+    found = find_upright(cues.moved(rough), vertical)
     whole = upright(rough @ T_WC, found.up) @ rough
     found = dataclasses.replace(
         found, up=turn.T @ found.up, normal=turn.T @ found.normal
     )
-    if gravity:
-        rest = (standing, edges, on_floor)
-        _, unaided = level(T_WC, T_WH, feet, present, landmarks, fps, fitted, (), *rest)
+    if cues.measured_up is not None:
+        without = dataclasses.replace(cues, measured_up=None)
+        _, unaided = level(T_WC, without, edges)
         cosine = float(np.clip(unaided.up @ turn[1], -1, 1))
         found = dataclasses.replace(
             found,
@@ -417,6 +414,14 @@ def level(
             unaided_sigma=unaided.sigma_if_sloping,
         )
     return whole, found
+
+
+def measured_up(
+    T_WC: Float[np.ndarray, "t 4 4"], gravity: tuple[float, ...]
+) -> Float[np.ndarray, " 3"] | None:
+    """Returns the up direction in the world, opposite to `gravity` in the first
+    camera's axes; `None` if `gravity` is empty, which means not measured."""
+    return -T_WC[0, :3, :3] @ np.asarray(gravity, float) if gravity else None
 
 
 def upright(

@@ -11,8 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from bodyslam_jax.io.pickle_machine import Instruction, Machine
-from bodyslam_jax.io.pickle_values import BLOB_BYTES, OBJECT_BYTES, Blob
+from bodyslam_jax.io.pickle_machine import (
+    BLOB_BYTES,
+    OBJECT_BYTES,
+    Blob,
+    Instruction,
+    Machine,
+)
 from bodyslam_jax.io.plain_arrays import VALUE_BYTES, Damaged, Refused, shown
 
 

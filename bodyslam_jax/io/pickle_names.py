@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax.io import plain_arrays
-from bodyslam_jax.io.pickle_machine import Machine
-from bodyslam_jax.io.pickle_values import (
+from bodyslam_jax.io.pickle_machine import (
     ArrayToFill,
     Blob,
     JoblibArray,
+    Machine,
     Name,
     StandIn,
     Storage,

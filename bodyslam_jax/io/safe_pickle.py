@@ -18,9 +18,8 @@ from typing import Any
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import plain_arrays
 from bodyslam_jax.io.pickle_instructions import STEPS
-from bodyslam_jax.io.pickle_machine import Machine
+from bodyslam_jax.io.pickle_machine import Machine, Name, StandIn, Storage
 from bodyslam_jax.io.pickle_names import CALLS, INERT, STORAGES
-from bodyslam_jax.io.pickle_values import Name, StandIn, Storage
 from bodyslam_jax.io.plain_arrays import Account, Damaged, Refused, shown
 
 __all__ = ["StandIn", "restricted_load"]

@@ -23,12 +23,11 @@ from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.ground.heights import wander
-from bodyslam_jax.pipeline.joint_problem import Prepared
+from bodyslam_jax.pipeline.joint_problem import Prepared, solve_stage
 from bodyslam_jax.pipeline.motion_prediction import (
     contact_predictor,
     contact_probability,
 )
-from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import Sequence, SfmResult
 
 _HEIGHT_SIGMA_M = 0.08

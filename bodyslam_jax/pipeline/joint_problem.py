@@ -1,15 +1,17 @@
-"""Builds the joint problem and its first state: cameras, people, map and scale."""
+"""Builds the joint problem and its first state: cameras, people, map and scale; and
+solves it once, by the schedule of the paper."""
 
 import dataclasses
 import functools
 import logging
+import time
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from bodyslam_jax import graph, initialisation, motion, people
+from bodyslam_jax import graph, initialisation, motion, people, solver
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PATH_SIGMA, Config, Measured
 from bodyslam_jax.config.errors import InputError
@@ -30,17 +32,19 @@ from bodyslam_jax.pipeline.people_floor import (
 from bodyslam_jax.types import Bodies, ScaleStart, Sequence, SfmResult
 
 log = logging.getLogger(__name__)
-
 _KINDS_WITHOUT_MAP = ("static", "rotation")
 """Kinds of camera motion without a map, where people alone determine the floor."""
-
 _STATURE_SIGMA_M = 0.07
 """Standard deviation of the statures of adults of one sex, m (NCD-RisC, eLife 2016),
 with which regressed statures hardly correlate."""
-
 Passengers = dict[int, tuple[float, float]]
 """People whose steps do not measure scale, as a vehicle or treadmill moves them: a map
 from their number to their speeds, m/s, as returned by `initialisation.carried`."""
+COST_ATOL = 0.005
+"""Decrease of the cost below which the solver stops. The cost is a negative
+log-likelihood, in which one standard deviation of one residual is 0.5. Without this
+bound, a few landmarks with little parallax keep moving for dozens of steps, with no
+effect on the rest of the state."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -377,3 +381,44 @@ def _make_problem(
     mask = jnp.zeros_like(problem.free.cameras)
     mask = mask.at[within].set(graph.gauge(state.cameras[within]))
     return eqx.tree_at(lambda p: p.free.cameras, problem, mask)
+
+
+def solve_stage(
+    problem: graph.Problem, state: graph.State, config: Config, name: str
+) -> tuple[solver.Solution, dict]:
+    """Solves the problem and returns the solution and the stage's entry for the report.
+
+    The stage named `joint` follows the schedule of the paper, any other only its last
+    step.
+    """
+    start = time.perf_counter()
+    schedule = schedule_of(config)
+    schedule = schedule if name == "joint" else schedule[-1:]
+    # Covariances that follow are of factors in double precision: one program is enough.
+    solution = solver.solve(
+        problem,
+        state,
+        solver=config.solver,
+        schedule=schedule,
+        mixed_precision=False,
+    )
+    before, after = float(solution.first_cost), float(solution.cost)
+    steps = sum(int(n) for n in solution.num_steps)
+    status = solution.status
+    log.info(
+        "%s: cost %.4g -> %.4g in %d steps, %s", name, before, after, steps, status
+    )
+    return solution, {
+        "name": name,
+        "cost_before": before,
+        "cost_after": after,
+        "iterations": steps,
+        "seconds": round(time.perf_counter() - start, 2),
+        "status": status,
+    }
+
+
+def schedule_of(config: Config) -> tuple[solver.Stage, ...]:
+    """Returns the stages of the joint solve, which stop by `COST_ATOL`."""
+    schedule = solver.paper_schedule(config.solver)
+    return tuple(dataclasses.replace(stage, atol=COST_ATOL) for stage in schedule)

@@ -6,34 +6,116 @@ through the foot meets the landmarks. Its first estimate uses people and landmar
 before the joint estimate. A second one, at the optimum, is a fixed point: a third
 changes scale by less than 0.1 %. A plane does not change with people and landmarks, so
 only ground that is not a plane is estimated again (`benchmarks/contact.md`).
+
+User-defined factors and variables are added to the complete problem, so that first
+values and the initial scale depend on the video alone. While standing feet are held,
+cameras, map and scale are constants, and so are the user's variables.
 """
 
 import dataclasses
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Many
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax import graph, initialisation, people, solver
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config, GraphWeights
+from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.diagnostics.scale_uncertainty import (
     covariance_sigma,
     inflate_fitted_shapes,
 )
 from bodyslam_jax.ground.vertical_edges import Edges
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
-from bodyslam_jax.pipeline.joint_problem import Prepared, prepare
-from bodyslam_jax.pipeline.own_terms import OwnTerms
+from bodyslam_jax.pipeline.joint_problem import Prepared, prepare, solve_stage
 from bodyslam_jax.pipeline.people_floor import people_on_floor
-from bodyslam_jax.pipeline.solve_stage import solve_stage
 from bodyslam_jax.types import (
     Bodies,
     JointEstimate,
     Keypoints,
+    OwnFactor,
+    OwnVariable,
     ScaleStart,
     Sequence,
     SfmResult,
 )
+
+Factors = Many[graph.Factor] | Callable[[graph.State], Many[graph.Factor]]
+"""Factors, or a function that makes them from the initial state of the joint solve: `t`
+frames, `h` people, landmarks and cameras in units of the map."""
+
+
+@dataclasses.dataclass(frozen=True)
+class OwnTerms:
+    """Factors and variables that a user adds to the joint problem."""
+
+    factors: Factors = ()
+    variables: Mapping[str, graph.Variable] = dataclasses.field(default_factory=dict)
+    """Named globals that `factors` depend on, with their priors."""
+
+    def __bool__(self) -> bool:
+        return callable(self.factors) or bool(self.factors or self.variables)
+
+    def added_to(self, prepared: Prepared) -> Prepared:
+        """Adds these terms to the prepared problem and its state.
+
+        **Raises:** `InputError` if a factor does not fit the problem, naming it.
+        """
+        if not self:
+            return prepared
+        try:
+            problem, state = prepared.problem.with_variables(
+                prepared.state, **self.variables
+            )
+            own = self.factors
+            own = own(prepared.state) if callable(own) else own
+            problem = problem.with_factors(*own)
+        except ValueError as error:
+            raise InputError(f"factors: {error}") from error
+        return dataclasses.replace(prepared, problem=problem, state=state)
+
+    def found(
+        self,
+        before: graph.Problem,
+        problem: graph.Problem,
+        state: graph.State,
+        marginals: solver.Marginals | None,
+    ) -> tuple[tuple[OwnVariable, ...], tuple[OwnFactor, ...]]:
+        """Returns values of the variables and misfits of the factors at the optimum.
+
+        `state` is the optimum of `problem`, which is `before` with these terms added.
+        Without `marginals` the sigmas of variables are NaN.
+        """
+        if not self:
+            return (), ()
+        values = problem.named(state.globals)
+        sigma = {}
+        if marginals is not None:
+            sigma = problem.named(jnp.sqrt(jnp.diagonal(marginals.globals)))
+        numbers = lambda x: tuple(np.atleast_1d(np.asarray(x, float)).tolist())
+        variables = []
+        for name, given in self.variables.items():
+            unknown = jnp.full_like(values[name], jnp.nan)
+            variables.append(
+                OwnVariable(
+                    name,
+                    numbers(values[name]),
+                    numbers(sigma.get(name, unknown)),
+                    numbers(given.value),
+                    numbers(np.broadcast_to(given.sigma, np.shape(values[name]))),
+                )
+            )
+        # Priors of variables precede the user's factors.
+        first = len(before.factors)
+        factors = [
+            _misfit(name, factor, state)
+            for name, factor in zip(problem.names[first:], problem.factors[first:])
+            if not isinstance(factor, graph.GlobalPrior)
+        ]
+        return tuple(variables), tuple(factors)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -275,3 +357,11 @@ def is_uneven(problem: graph.Problem) -> bool:
     grounds = [f for f in problem.factors if isinstance(f, graph.GroundContact)]
     used = [np.asarray(f.offset)[np.isfinite(np.asarray(f.sigma))] for f in grounds]
     return any(len(offset) > 0 and np.ptp(offset) > 0 for offset in used)
+
+
+def _misfit(name: str, factor: graph.Factor, state: graph.State) -> OwnFactor:
+    """Returns the misfit of a factor; residuals of exactly 0 count as missing."""
+    residual = np.asarray(graph.residual_of(factor, state))
+    count = int(np.count_nonzero(residual))
+    cost = float(factor.cost(state))
+    return OwnFactor(name, count, cost, (2 * cost / count) ** 0.5 if count else 0.0)

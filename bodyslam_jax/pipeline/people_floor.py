@@ -20,7 +20,7 @@ from bodyslam_jax import graph, initialisation
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.config import GraphWeights
-from bodyslam_jax.ground.gravity import Upright, level
+from bodyslam_jax.ground.gravity import GravityCues, Upright, level, measured_up
 from bodyslam_jax.ground.stances import toes_standing
 from bodyslam_jax.ground.vertical_edges import Edges
 from bodyslam_jax.types import Keypoints
@@ -169,18 +169,18 @@ def _upright(
     feet = joints[..., list(FEET), :] @ np.swapaxes(roots[..., :3, :3], -1, -2)
     feet = feet + roots[..., None, :3, 3]
     standing = toes_standing(None if probability is None else np.asarray(probability))
-    return level(
-        cameras,
-        roots,
-        feet,
-        view.present,
-        np.zeros((0, 3)),
-        view.fps,
-        view.fitted,
-        view.gravity,
-        standing,
-        view.edges,
-    )[1]
+    cues = GravityCues(
+        trunks=roots[..., :3, 1],
+        feet=feet,
+        present=view.present,
+        eyes=cameras[:, :3, 3],
+        landmarks=np.zeros((0, 3)),
+        fps=view.fps,
+        fitted=view.fitted,
+        measured_up=measured_up(cameras, view.gravity),
+        standing=standing,
+    )
+    return level(cameras, cues, view.edges)[1]
 
 
 _local_joints = eqx.filter_jit(body_.local_joints)

@@ -79,11 +79,13 @@ class Counter:
     """Reports how many frames of a stage are done: by a log line every few seconds, and
     by DEBUG records in between, from which a handler can draw a bar."""
 
-    def __init__(self, stage: str, total: int) -> None:
+    def __init__(self, stage: str, total: int = 0) -> None:
         self.stage, self.total = stage, total
         self._last_line = self._last_update = time.perf_counter()
 
-    def __call__(self, done: int) -> None:
+    def __call__(self, done: int, total: int | None = None) -> None:
+        """Reports `done` frames of `total`; without it, of that of the constructor."""
+        self.total = total or self.total
         now = time.perf_counter()
         is_line = now - self._last_line > _LINE_INTERVAL_S
         if now - self._last_update < _UPDATE_INTERVAL_S and done < self.total:

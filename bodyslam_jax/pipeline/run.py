@@ -4,34 +4,33 @@ Each stage's result is kept in a `Cache` under a fingerprint of all that it depe
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from bodyslam_jax import diagnostics, graph, motion, people, sfm
-from bodyslam_jax.body import BodyModel, load_body_model, rest_joints
+from bodyslam_jax.body import (
+    DEFAULT,
+    BodyModel,
+    load_body_model,
+    rest_joints,
+    search_paths,
+)
+from bodyslam_jax.body.files import candidates, named_gender
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.export.summary import summarise
-from bodyslam_jax.geometry.lengths import padded_length
-from bodyslam_jax.ground.vertical_edges import Edges
+from bodyslam_jax.ground.vertical_edges import Edges, make_edges
 from bodyslam_jax.pipeline import joint_stage, people_stage, sfm_stage
-from bodyslam_jax.pipeline.default_body import with_compatible_body
-from bodyslam_jax.pipeline.intrinsics import with_intrinsics
-from bodyslam_jax.pipeline.own_terms import Factors, OwnTerms
+from bodyslam_jax.pipeline.joint_stage import Factors, OwnTerms
 from bodyslam_jax.pipeline.people_stage import with_warnings
-from bodyslam_jax.pipeline.progress import Counter, Stopwatch, compiling
-from bodyslam_jax.pipeline.sfm_stage import find_edges
+from bodyslam_jax.pipeline.progress import Stopwatch, compiling
 from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
 from bodyslam_jax.pipeline.to_metric import to_metric
-from bodyslam_jax.types import (
-    Bodies,
-    JointEstimate,
-    Result,
-    Sequence,
-    SfmResult,
-    Tracks,
-)
+from bodyslam_jax.types import Bodies, JointEstimate, Result, Sequence, SfmResult
 
 _MIN_FRAMES = 3
 """Least number of frames of a sequence that can be estimated."""
@@ -74,37 +73,125 @@ def run_stages(
     """
     _check_length(sequence)
     watch = Stopwatch()
-    body = load_body_model(config.body_model)
+    files_body = load_body_model(config.body_model)
     model = motion.load_motion_model(config.motion_model)
     if config.people:  # Checked before stages that take minutes and need no motion.
-        motion.check_compatible(model, body, model.fps)
+        motion.check_compatible(model, files_body, model.fps)
     sequence = people_stage.detect(sequence, config, cache, watch)
-    sequence = diagnostics.reconcile(sequence, body)
-    cameras, bodies = before_joint(sequence, body, config, cache, watch)
-    key = fingerprint(sequence, config)
-    everybody = sequence
-    sequence = people.select_people(sequence, config.person)
-    refined = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
-    files_body, body = body, _body_that_reaches(body, config)
-    edges = None
-    if cameras.kind != "moving":  # Edges determine the slope of the floor.
+    sequence = diagnostics.reconcile(sequence, files_body)
+    used, cameras, bodies = before_joint(sequence, files_body, config, cache, watch)
+    body = _body_that_reaches(files_body, config)
+    key = fingerprint(sequence)
+    segments = None  # Edges determine the slope of the floor and the direction of up.
+    if sequence.frames is not None and cameras.kind != "failed":
+        seen = cameras.within
         with watch("edges"):
-            edges = find_edges(everybody, cameras, cache=cache)
+            find = functools.partial(sfm.find_segments, sequence, seen)
+            key_of_segments = fingerprint(key, seen)
+            segments = cache.stage("segments", key_of_segments, sfm.Segments, find)
+    edges = _edges(segments, cameras.zoom, cameras.T_WC, cameras.intrinsics)
+    of_floor = None if cameras.kind == "moving" else edges
+
+    def solve() -> JointEstimate:
+        number, num_frames = bodies.present.shape
+        with compiling("joint", people_stage.size_of(num_frames, number)):
+            return joint_stage.estimate(
+                used, cameras, bodies, body, config, of_floor, own
+            )
+
     with watch("joint"):
-        given = refined, cameras, bodies, body, config, edges, own
-
-        def compute() -> JointEstimate:
-            with compiling("joint", _size(refined)):
-                return joint_stage.estimate(*given)
-
         # The code of a user-defined factor has no fingerprint.
-        joint = compute() if own else cache.stage("joint", key, JointEstimate, compute)
+        kept = Cache(None) if own else cache
+        key = fingerprint(key, config)
+        joint = kept.stage("joint", key, JointEstimate, solve)
     if cameras.kind == "moving":
-        with watch("edges"):
-            edges = find_edges(everybody, cameras, joint, cache)
+        edges = _edges(segments, cameras.zoom, joint.cameras, joint.intrinsics)
     with watch("verdict"):
+        sequence = people.select_people(sequence, config.person)
         result = assemble(sequence, config, body, cameras, joint, watch.seconds, edges)
-    return _with_shapes_of(files_body, body, result), cameras, refined
+    return _with_shapes_of(files_body, body, result), cameras, used
+
+
+def _edges(
+    segments: sfm.Segments | None,
+    zoom: Float[np.ndarray, " t"] | None,
+    T_WC: Float[np.ndarray, "t 4 4"],
+    intrinsics: Float[np.ndarray, " i"],
+) -> Edges | None:
+    """Returns straight segments of zoomed images as edges in the world of the cameras;
+    `None` if no images were searched."""
+    if segments is None:
+        return None
+    ends = segments.ends
+    if zoom is not None:
+        centre = intrinsics[2:4]
+        size = np.exp(zoom[segments.frame])[:, None, None]
+        ends = centre + (ends - centre) / size
+    R_WC = T_WC[:, :3, :3]
+    return make_edges(segments.frame, ends, segments.searched, R_WC, intrinsics)
+
+
+def with_compatible_body(
+    config: Config, gender: str | None = None
+) -> tuple[Config, tuple[str, ...]]:
+    """Returns settings with a body that the motion model was trained on, and warnings.
+
+    Args:
+        gender: gender of the body model that given bodies belong to, if stated. The
+            model of that gender is taken from the folder in the settings, or from the
+            installed ones; if there is none, a warning says so.
+
+    A body model that was found on this machine, not named by the user, is replaced by
+    the default body if the motion model belongs to that one; a warning says so. A body
+    model that the user names is kept: a mismatch is rejected later.
+    """
+    config, warnings = _with_default_body(config)
+    if gender is None or not config.people:
+        return config, warnings
+    named = None if config.body_model is None else Path(config.body_model)
+
+    def fits(file: Path) -> bool:
+        """Returns True for an installed model of the gender, and of the motion model's
+        kind unless the user named its folder."""
+        if not file.is_file() or file == DEFAULT:
+            return False
+        if named_gender(file) not in (gender, None):
+            return False
+        if named is not None:
+            return True
+        kind = motion.load_motion_model(config.motion_model).body
+        return load_body_model(file).kind == kind
+
+    files = search_paths(gender) if named is None else candidates(named, gender)
+    fitting = next(filter(fits, files), None)
+    if fitting is not None:
+        return dataclasses.replace(config, body_model=str(fitting)), warnings
+    if gender == "neutral" and (named is None or named == DEFAULT or named.is_dir()):
+        return config, warnings
+    used = "the default body" if named in (None, DEFAULT) else str(named)
+    text = (
+        f"the given bodies belong to the {gender} model, but {used} is used, in which "
+        "their β mean another shape: name a folder with the model of that gender "
+        "(--body-model)."
+    )
+    return config, (*warnings, text)
+
+
+def _with_default_body(config: Config) -> tuple[Config, tuple[str, ...]]:
+    """Replaces a body model that was found on this machine but does not match the
+    motion model by the default body; returns settings and warnings."""
+    file = body_model_file(config.body_model)
+    if config.body_model is not None or file is None or not config.people:
+        return config, ()
+    model = motion.load_motion_model(config.motion_model)
+    found = load_body_model(file)
+    if found.kind == model.body or model.body != load_body_model(DEFAULT).kind:
+        return config, ()
+    text = (
+        f"{file} is not used: the motion model was trained on the default body; "
+        "name both, --body-model and a --motion-model of `bodyslam train-motion`."
+    )
+    return dataclasses.replace(config, body_model=str(DEFAULT)), (text,)
 
 
 def _body_that_reaches(body: BodyModel, config: Config) -> BodyModel:
@@ -135,47 +222,21 @@ def before_joint(
     config: Config,
     cache: Cache = Cache(None),
     watch: Stopwatch | None = None,
-) -> tuple[SfmResult, Bodies]:
+) -> tuple[Sequence, SfmResult, Bodies]:
     """Estimates cameras and map up to scale, and bodies in the camera frame: the
     initial values of the graph.
+
+    Returns first the input as the joint estimate uses it: with the selected people, the
+    estimated intrinsics, and without zoom.
 
     **Raises:** as `run`.
     """
     watch = watch or Stopwatch()
-    key = fingerprint(sequence, config.tracking)
-    with watch("tracks"):
-        tracks = cache.stage("tracks", key, Tracks, lambda: _tracks(sequence, config))
-    key = fingerprint(
-        key, config.structure, config.weights.landmark_loss, config.static_camera
+    cameras = sfm_stage.cameras_and_map(sequence, config, cache, watch)
+    used, bodies = people_stage.bodies_in_camera(
+        sequence, cameras, body, config, cache, watch
     )
-    with watch("cameras"):
-        cameras = cache.stage(
-            "cameras",
-            key,
-            SfmResult,
-            lambda: sfm_stage.estimate(sequence, tracks, config),
-        )
-    sequence = people.select_people(sequence, config.person)
-    sequence = with_intrinsics(sequence, cameras.intrinsics, cameras.zoom)
-    model = body_model_file(config.body_model)
-    key = fingerprint(sequence, config.people_fit, config.people, model)
-
-    def compute() -> Bodies:
-        with compiling("people", _size(sequence)):
-            return people_stage.estimate_bodies(sequence, body, config)
-
-    with watch("people"):
-        bodies = cache.stage("people", key, Bodies, compute)
-    return cameras, bodies
-
-
-def _size(sequence: Sequence) -> str:
-    """Returns the sizes of arrays that determine which programs a sequence needs."""
-    keypoints, bodies = sequence.keypoints, sequence.bodies
-    number = 0 if keypoints is None else len(keypoints.uv)
-    if bodies is not None:
-        number = max(number, len(bodies.present))
-    return f"{padded_length(sequence.num_frames)} frames, {number} people"
+    return used, cameras, bodies
 
 
 def assemble(
@@ -205,11 +266,3 @@ def _check_length(sequence: Sequence) -> None:
             f"{sequence.name}: {sequence.num_frames} frames, expected at least "
             f"{_MIN_FRAMES}: size and motion come from what moves."
         )
-
-
-def _tracks(sequence: Sequence, config: Config) -> Tracks:
-    """Returns the given tracks, or tracks features through the images."""
-    if sequence.tracks is not None:
-        return sequence.tracks
-    counter = Counter("tracks", sequence.num_frames)
-    return sfm.track(sequence, config.tracking, lambda k, _: counter(k))

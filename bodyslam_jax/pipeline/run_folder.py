@@ -1,23 +1,37 @@
-"""Runs that keep stages and result in a locked folder, and the demonstration."""
+"""Runs that keep stages, result and pictures in a locked folder, the demonstration, and
+the initial values of the joint estimate as a run folder keeps them."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TypeVar
 
-from bodyslam_jax import evaluation, export, io, simulation
-from bodyslam_jax.body import load_body_model
+import jax.numpy as jnp
+import numpy as np
+
+from bodyslam_jax import evaluation, export, io, sfm, simulation, view
+from bodyslam_jax.body import BodyModel, joints, load_body_model, rest_joints
 from bodyslam_jax.config import Config
 from bodyslam_jax.evaluation import before_after
 from bodyslam_jax.export.summary import describe
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.budget import granted
-from bodyslam_jax.pipeline.default_body import with_compatible_body
 from bodyslam_jax.pipeline.people_stage import check_people, with_warnings
-from bodyslam_jax.pipeline.pictures import check_overlay, write_pictures
-from bodyslam_jax.pipeline.progress import Stopwatch
-from bodyslam_jax.pipeline.run import run_stages
-from bodyslam_jax.pipeline.stage_cache import Cache
-from bodyslam_jax.types import Result, Sequence
+from bodyslam_jax.pipeline.progress import Stopwatch, counted
+from bodyslam_jax.pipeline.run import run_stages, with_compatible_body
+from bodyslam_jax.pipeline.stage_cache import Cache, load
+from bodyslam_jax.types import (
+    Bodies,
+    JointEstimate,
+    Result,
+    Sequence,
+    SfmResult,
+    Tracks,
+)
 
 _SCENE_FOLDER = "scene"
 """Subfolder of the run folder that holds the input of the demonstration."""
+_CODEC_BY_SUFFIX: dict[str, view.Codec] = {"webm": "VP8", "mp4": "H264"}
+T = TypeVar("T")
 
 
 def run_to_folder(sequence: Sequence, out: Path, config: Config = Config()) -> Result:
@@ -96,3 +110,133 @@ def demo(
         cache = stage_cache_of(sequence, out)
         export.check_folder(out, cache.source, cache.owner())
         return run_in_locked_folder(sequence, out, config, cache)
+
+
+def check_overlay(config: Config) -> None:
+    """Checks that the encoder of the overlay is installed.
+
+    **Raises:** `ValueError` if it is not.
+    """
+    if config.overlay:
+        view.check_codec(_CODEC_BY_SUFFIX[config.overlay_video])
+
+
+def write_pictures(
+    folder: Path,
+    sequence: Sequence,
+    cameras: SfmResult,
+    result: Result,
+    body: BodyModel,
+    config: Config,
+    watch: Stopwatch,
+) -> bytes | None:
+    """Writes overlay and `scene.html`; returns a frame of the overlay (JPEG), `None`
+    without a video.
+
+    Args:
+        sequence: the input, with the keypoints of the people of `result` in its order.
+    """
+    observations = _map_observations(cameras)
+    middle = view.middle_frame(result)
+    number = len(cameras.landmarks)
+    sampler = view.VideoSampler(sequence.num_frames, observations, number, middle)
+    if sequence.frames is not None:
+        stage = "overlay" if config.overlay else "images"
+        every = counted(_images(sequence, cameras), stage, sequence.num_frames)
+        images = sampler.watch(every)
+        with watch(stage):
+            if config.overlay:
+                measured = config.overlay_measurements
+                view.write_overlay(
+                    folder / f"overlay.{config.overlay_video}",
+                    images,
+                    result,
+                    body,
+                    observations if measured else None,
+                    codec=_CODEC_BY_SUFFIX[config.overlay_video],
+                    keypoints=sequence.keypoints if measured else None,
+                )
+            for _ in images:  # The sampler sees those that the overlay did not need.
+                pass
+    with watch("scene"):
+        view.write_scene(folder / "scene.html", result, body, sampler.samples())
+    if sampler.whole is None:
+        return None
+    return view.still(sampler.whole, result, body, middle)
+
+
+def _images(sequence: Sequence, cameras: SfmResult) -> Iterator[np.ndarray]:
+    """Returns the images; for a camera that zooms, with the zoom undone."""
+    images = io.frames(sequence)
+    if cameras.zoom is None:
+        return images
+    return sfm.without_zoom(images, cameras.zoom, cameras.intrinsics[2:4])
+
+
+def _map_observations(cameras: SfmResult) -> Tracks:
+    """Returns the inlier observations of the landmarks."""
+    tracks, keep = cameras.tracks, cameras.keep
+    return Tracks(tracks.frame[keep], tracks.landmark[keep], tracks.uv[keep])
+
+
+def start_of_joint(run: Path, result: Result, body: BodyModel) -> Result | None:
+    """Returns cameras and map of structure from motion and bodies of the people stage,
+    with the first scale, from the stages kept in a run folder.
+
+    The first located camera coincides with that of `result`. Returns `None` if the
+    folder keeps no such stages, or those of another result.
+    """
+    cameras = _stage(run, "cameras", SfmResult)
+    bodies = _stage(run, "people", Bodies)
+    joint = _stage(run, "joint", JointEstimate)
+    if cameras is None or bodies is None or joint is None:
+        return None
+    shape = result.present.shape
+    if bodies.present.shape != shape or cameras.T_WC.shape != result.T_WC.shape:
+        return None
+    scale = joint.start.value
+    T_WC = cameras.T_WC.copy()
+    T_WC[:, :3, 3] *= scale
+    first = int(np.argmax(result.located))
+    move = result.T_WC[first] @ np.linalg.inv(T_WC[first])
+    T_WC = move @ T_WC
+    landmarks = scale * cameras.landmarks @ move[:3, :3].T + move[:3, 3]
+    poses = bodies.poses.copy()
+    poses[..., :3] = so3.log(T_WC[:, :3, :3] @ so3.exp(poses[..., :3]))
+    # A person has one shape: the median, as the people stage has one per frame.
+    betas = np.stack(
+        [
+            np.median(beta[there], axis=0) if there.any() else np.zeros(10)
+            for beta, there in zip(bodies.shapes, bodies.present, strict=True)
+        ]
+    ).reshape(len(bodies.present), 10)
+    rest = np.asarray(rest_joints(body, jnp.asarray(betas, body.dtype)), np.float64)
+    pelvis = rest[:, None, 0] + bodies.trans
+    pelvis = np.einsum("tij,htj->hti", T_WC[:, :3, :3], pelvis) + T_WC[:, :3, 3]
+    trans = pelvis - rest[:, None, 0]
+    cast = lambda x: jnp.asarray(x, body.dtype)
+    posed = joints(body, cast(poses), cast(betas[:, None]), cast(trans))
+    return Result(
+        timestamps=result.timestamps,
+        T_WC=T_WC,
+        scale=scale,
+        intrinsics=cameras.intrinsics,
+        landmarks=landmarks if cameras.kind == "moving" else landmarks[:0],
+        poses=poses,
+        trans=trans,
+        betas=betas,
+        joints=np.asarray(posed, np.float64),
+        present=bodies.present,
+        summary={k: result.summary[k] for k in ("input", "frames_used")},
+    )
+
+
+def _stage(run: Path, name: str, kind: type[T]) -> T | None:
+    """Loads a stage from a run folder; `None` if there is none, or it is unreadable."""
+    found = sorted((run / ".cache").glob(f"{name}-*.npz"))
+    if len(found) != 1:
+        return None
+    try:
+        return load(found[0], kind)
+    except Exception:  # the page is shown without what cannot be read
+        return None

@@ -12,7 +12,7 @@ from bodyslam_jax.config import Config
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.lengths import lengthened, padded_length
 from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
-from bodyslam_jax.ground.gravity import Upright, level
+from bodyslam_jax.ground.gravity import GravityCues, Upright, level, measured_up
 from bodyslam_jax.ground.stances import find_stances, toes_standing
 from bodyslam_jax.ground.vertical_edges import Edges
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
@@ -39,19 +39,19 @@ def to_metric(
     above = np.zeros((*joint.present.shape, 3)) if above is None else above
     landmarks = joint.scale * joint.landmarks
     standing = toes_standing(joint.contacts)
-    turn, up = level(
-        T_WC,
-        T_WC @ joint.roots,
-        joints[:, :, list(FEET)] - above[:, :, None],
-        joint.present,
-        landmarks if cameras.kind == "moving" else landmarks[:0],
-        sequence.fps,
-        people.without_bodies(sequence),
-        config.gravity,
-        standing,
-        edges,
-        joint.on_floor,
+    cues = GravityCues(
+        trunks=(T_WC @ joint.roots)[..., :3, 1],
+        feet=joints[:, :, list(FEET)] - above[:, :, None],
+        present=joint.present,
+        eyes=T_WC[:, :3, 3],
+        landmarks=landmarks if cameras.kind == "moving" else landmarks[:0],
+        fps=sequence.fps,
+        fitted=people.without_bodies(sequence),
+        measured_up=measured_up(T_WC, config.gravity),
+        standing=standing,
+        on_floor=joint.on_floor,
     )
+    turn, up = level(T_WC, cues, edges)
     T_WC = turn @ T_WC
     landmarks = landmarks @ turn[:3, :3].T + turn[:3, 3]
     poses, trans, joints = _placed(sequence, config, body, joint, T_WC)

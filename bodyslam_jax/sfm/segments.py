@@ -4,7 +4,7 @@ import dataclasses
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.io.video import frames as read_frames
 from bodyslam_jax.sfm.person_mask import person_masks
@@ -14,6 +14,8 @@ _PERSON_MARGIN = 0.05
 """Width added to people's masks, relative to their height in the image."""
 _MIN_LENGTH_SHARE = 0.05
 """Least length of a segment, as a share of the image's longer side."""
+_NUM_IMAGES = 24
+"""Number of images that are searched, evenly spread over the clip."""
 _NUM_MASK_SAMPLES = 7
 """Number of points of a segment at which the mask of people is looked up."""
 
@@ -26,11 +28,13 @@ class Segments:
     """Index of the frame."""
     ends: Float[np.ndarray, "s 2 2"]
     """Image positions of both ends, px."""
+    searched: Int[np.ndarray, " n"]
+    """Indices of the frames that were searched for segments."""
 
 
-def find_segments(sequence: Sequence, wanted: Int[np.ndarray, " n"]) -> Segments:
-    """Detects segments in the frames `wanted` that are on no person, by OpenCV's LSD
-    (Grompone von Gioi et al., 2010).
+def find_segments(sequence: Sequence, within: Bool[np.ndarray, " t"]) -> Segments:
+    """Detects segments that are on no person in some of the frames `within`, by
+    OpenCV's LSD (Grompone von Gioi et al., 2010).
 
     **Raises:** `ValueError` if the sequence has no images or one cannot be read.
     """
@@ -38,7 +42,9 @@ def find_segments(sequence: Sequence, wanted: Int[np.ndarray, " n"]) -> Segments
     shortest = _MIN_LENGTH_SHARE * max(
         sequence.intrinsics.width, sequence.intrinsics.height
     )
-    chosen, last = set(wanted.tolist()), int(max(wanted, default=-1))
+    frames = np.flatnonzero(within)
+    chosen = np.unique(frames[_spread(len(frames))])
+    last = int(max(chosen, default=-1))
     frame, ends = [np.zeros(0, int)], [np.zeros((0, 2, 2))]
     images = read_frames(sequence, gray=True)
     masks = person_masks(sequence, _PERSON_MARGIN)
@@ -60,4 +66,10 @@ def find_segments(sequence: Sequence, wanted: Int[np.ndarray, " n"]) -> Segments
             found = found[~(mask[row, column] > 0).any(axis=1)]
         frame.append(np.full(len(found), k))
         ends.append(found)
-    return Segments(np.concatenate(frame), np.concatenate(ends))
+    return Segments(np.concatenate(frame), np.concatenate(ends), chosen)
+
+
+def _spread(num_frames: int) -> Int[np.ndarray, " n"]:
+    """Returns the positions of the images that are searched among `num_frames`."""
+    places: Float[np.ndarray, " n"] = np.linspace(0, num_frames - 1, _NUM_IMAGES)
+    return places.round().astype(int)

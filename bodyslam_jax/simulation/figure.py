@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.ndimage import gaussian_filter
 
-from bodyslam_jax.simulation.body_regions import (
+from bodyslam_jax.simulation.garments import (
     EYE,
     HAIR,
     IRIS,
@@ -26,10 +26,8 @@ from bodyslam_jax.simulation.body_regions import (
     Head,
     Outfit,
     draw_outfit,
-    parts_of,
-)
-from bodyslam_jax.simulation.garments import (
     hair_sheet,
+    parts_of,
     skirt_sheet,
     with_sheet,
     with_shoes,

@@ -19,10 +19,16 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io import atomic
 from bodyslam_jax.motion import FPS
 from bodyslam_jax.simulation.figure import Figure, dress
-from bodyslam_jax.simulation.raster import make_texture, rasterise, vertex_normals
+from bodyslam_jax.simulation.raster import (
+    Shutter,
+    around,
+    cameras_at,
+    make_texture,
+    rasterise,
+    vertex_normals,
+)
 from bodyslam_jax.simulation.room import Room, Surface, texture_size
 from bodyslam_jax.simulation.sequences import SimulatedSequence
-from bodyslam_jax.simulation.shutter import Shutter, around, cameras_at
 
 _NEAR_PLANE_M = 0.05
 _MIPMAP_LEVELS = 7

@@ -34,16 +34,17 @@ from bodyslam_jax.simulation.gait_synthesis import (
     walk_along,
     walking_clips,
 )
-from bodyslam_jax.simulation.point_tracks import is_behind, track_points
 from bodyslam_jax.simulation.posing import Person
 from bodyslam_jax.simulation.room import Room, furnish, put_in_the_way
 from bodyslam_jax.simulation.sensor_noise import (
     NOISE,
     Regressed,
     detect_keypoints,
+    is_behind,
     noise_of_bodies,
     noise_of_keypoints,
     regress_bodies,
+    track_points,
 )
 from bodyslam_jax.types import (
     Bodies,

@@ -62,7 +62,7 @@ def stack(cases: Sequence[tuple[Problem, State]]) -> tuple[Problem, State]:
     """Problems and states of equal structure as one of each, with a leading axis.
 
     All are padded to the frames, landmarks and observations of the least common size
-    (`graph/sizes.py`) that holds each of them.
+    (`graph/layout.py`) that holds each of them.
 
     **Raises:** `ValueError` that names the first case which differs from the one before
     it, and in what, or if there is no case, or no common size.

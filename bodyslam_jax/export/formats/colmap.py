@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from bodyslam_jax.export.formats.observations import Observations
-from bodyslam_jax.export.formats.scene import Scene
-from bodyslam_jax.export.formats.views import (
+from bodyslam_jax.export.formats.scene import (
     PIXEL_CENTRE_OFFSET_PX,
+    Observations,
+    Scene,
     Views,
     reprojection_errors,
     views_of,

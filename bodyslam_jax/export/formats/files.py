@@ -13,9 +13,14 @@ from pathlib import Path
 from bodyslam_jax import evaluation
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.export.formats.observations import Observations
 from bodyslam_jax.export.formats.registry import FORMATS, Format
-from bodyslam_jax.export.formats.scene import Scene, Up, make_scene, of_people
+from bodyslam_jax.export.formats.scene import (
+    Observations,
+    Scene,
+    Up,
+    make_scene,
+    of_people,
+)
 from bodyslam_jax.io import atomic
 from bodyslam_jax.types import Result
 

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from bodyslam_jax.export.folder import write_points
-from bodyslam_jax.export.formats.scene import Scene
-from bodyslam_jax.export.formats.views import views_of
+from bodyslam_jax.export.formats.scene import Scene, views_of
 
 _POINTS_FILE = "points.ply"
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])

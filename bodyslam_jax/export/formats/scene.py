@@ -1,4 +1,9 @@
-"""The scene that every format is written from: a result in the requested world."""
+"""The scene that every format is written from: a result in the requested world.
+
+It has the pixel observations of the run's landmarks, read from its cached stages, and
+`Views`: cameras, images and points in the conventions of photogrammetry, which the
+files of COLMAP and nerfstudio share.
+"""
 
 import dataclasses
 import functools
@@ -12,8 +17,10 @@ from jaxtyping import Bool, Float, Int
 from bodyslam_jax import evaluation
 from bodyslam_jax.body import PARENTS, BodyModel, rest_joints
 from bodyslam_jax.config.errors import InputError
-from bodyslam_jax.export.formats.observations import Observations
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.camera import project
+from bodyslam_jax.io.archive import read_npz
+from bodyslam_jax.io.video import extract_frames, frame_name
 from bodyslam_jax.types import Result
 
 Up = Literal["y", "z"]
@@ -26,6 +33,26 @@ _MAX_FINE_GRID_M = 100.0
 _MAX_TIMING_ERROR_FRAMES = 0.25
 """Deviation of timestamps from a constant rate, in frame intervals, up to which the
 rate counts as constant."""
+_ZOOM_KEY = ".zoom"
+_MAX_LOG_ZOOM = 10.0
+"""Logarithm of a factor on the focal length that exceeds any lens."""
+PIXEL_CENTRE_OFFSET_PX = 0.5
+"""Offset from coordinates with integer pixel centres to those with the origin at the
+image's corner."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Observations:
+    """Inlier observations of a result's landmarks, `m` in all."""
+
+    frame: Int[np.ndarray, " m"]
+    landmark: Int[np.ndarray, " m"]
+    """Index into `Result.landmarks`."""
+    uv: Float[np.ndarray, "m 2"]
+    """Pixels in the video's images, px; pixel centres have integer coordinates."""
+    zoom: Float[np.ndarray, " t"] | None = None
+    """Focal length of each frame relative to `Result.intrinsics`; `None` if the camera
+    does not zoom."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,3 +286,93 @@ def _input(result: Result) -> dict[str, Any]:
     """Returns the summary's entry on the video; empty without a summary."""
     found = result.summary.get("input")
     return found if isinstance(found, dict) else {}
+
+
+def read_observations(run: Path, result: Result) -> Observations | None:
+    """Reads the observations from the stage results in the `.cache` of a run folder.
+
+    Returns `None` if the folder has none that belong to `result`: the result can then
+    still be exported, with landmarks that no image refers to.
+    """
+    found = sorted((run / ".cache").glob("cameras-*.npz"))
+    if len(found) != 1 or not len(result.landmarks):
+        return None
+    t, l = len(result.timestamps), len(result.landmarks)
+    try:
+        archive = read_npz(found[0])
+        if archive.header(".landmarks")[0] != (l, 3):
+            return None
+        index = {"kind": "whole", "low": 0}
+        frame = archive.array(".tracks.frame", ("m",), high=t - 1, **index)
+        landmark = archive.array(".tracks.landmark", ("m",), high=l - 1, **index)
+        uv = archive.array(".tracks.uv", ("m", 2))
+        keep = archive.array(".keep", ("m",), kind="boolean")
+        zoom = None
+        if _ZOOM_KEY in archive:
+            zoom = archive.array(
+                _ZOOM_KEY, (t,), low=-_MAX_LOG_ZOOM, high=_MAX_LOG_ZOOM
+            )
+    except InputError:
+        return None
+    frame, landmark, uv = frame[keep], landmark[keep], uv[keep]
+    if zoom is None:
+        return Observations(frame, landmark, uv)
+    # The stages work on images whose zoom is undone about the principal point.
+    factor, centre = np.exp(zoom), result.intrinsics[2:4]
+    uv = centre + (uv - centre) * factor[frame][:, None]
+    return Observations(frame, landmark, uv, factor)
+
+
+@dataclasses.dataclass(frozen=True)
+class Views:
+    """Located frames, `n` in all, with the intrinsics of each."""
+
+    frames: Int[np.ndarray, " n"]
+    """Indices of the result's frames, increasing."""
+    names: list[str]
+    """Names of their images."""
+    T_WC: Float[np.ndarray, "n 4 4"]
+    model: str
+    """COLMAP's name of the camera model: `PINHOLE` or `OPENCV`."""
+    intrinsics: Float[np.ndarray, "c i"]
+    """`fx fy cx cy`, with `k1 k2 p1 p2` for `OPENCV`; px from the image's corner. One
+    row, or one for each view of a camera that zooms."""
+
+    @property
+    def zooms(self) -> bool:
+        """Whether each view has intrinsics of its own."""
+        return len(self.intrinsics) > 1
+
+
+def views_of(scene: Scene, images: Path) -> Views:
+    """Returns the located frames; their images are written into a folder if there is a
+    video.
+
+    **Raises:** `ValueError` if the video is not the one of the result.
+    """
+    result = scene.result
+    frames = np.flatnonzero(result.located)
+    if scene.video is None:
+        names = [frame_name(int(k)) for k in frames]
+    else:
+        names = extract_frames(scene.video, result.timestamps, frames, images)
+    factor = scene.focal_factor[frames]
+    factor = factor if len(factor) and np.ptp(factor) > 0 else factor[:1]
+    intrinsics = np.tile(result.intrinsics, (len(factor), 1)).astype(np.float64)
+    intrinsics[:, :2] *= factor[:, None]
+    intrinsics[:, 2:4] += PIXEL_CENTRE_OFFSET_PX
+    model = "PINHOLE" if intrinsics.shape[1] == 4 else "OPENCV"
+    return Views(frames, names, result.T_WC[frames], model, intrinsics)
+
+
+def reprojection_errors(scene: Scene, seen: Observations) -> Float[np.ndarray, " m"]:
+    """Returns the distance between each observation and its landmark's projection,
+    px."""
+    result = scene.result
+    T = result.T_WC[seen.frame]
+    offset = result.landmarks[seen.landmark] - T[:, :3, 3]
+    p_C = np.einsum("mji,mj->mi", T[:, :3, :3], offset)
+    intrinsics = np.tile(result.intrinsics, (len(T), 1)).astype(np.float64)
+    intrinsics[:, :2] *= scene.focal_factor[seen.frame][:, None]
+    uv = np.asarray(project(jnp.asarray(intrinsics), jnp.asarray(p_C)))
+    return np.linalg.norm(uv - seen.uv, axis=1)

@@ -4,5 +4,5 @@ All are subclasses of `graph.factor.FrameFactor`, except those of landmarks. Fac
 created from measurements in `initialisation`: those of people in
 `people_factors.py`, of the motion model in `motion_factors.py`, of cameras and
 landmarks in `map_factors.py` and of the ground in `ground.py`; those of intrinsics in
-`pipeline/bundle_adjustment.py`.
+`pipeline/sfm_stage.py`.
 """

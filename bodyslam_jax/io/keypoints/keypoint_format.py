@@ -56,7 +56,7 @@ class KeypointFormat(Format):
     layout: ClassVar[tuple[str, ...] | None] = None
     """Names of the points in the files' order, such as `left_knee`; `None` for formats
     that are written in several orders: then names in the file count, or the number of
-    points and the distances between them (`layouts`, `layout_evidence`)."""
+    points and the distances between them (`layouts`, `arrange`)."""
 
     @abc.abstractmethod
     def read(self, source: Source, num_frames: int | None) -> Listed:

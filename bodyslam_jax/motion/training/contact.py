@@ -26,8 +26,15 @@ from bodyslam_jax.body import BodyModel, keypoints, local_joints, rest_joints
 from bodyslam_jax.body.skeleton import BODY25_TOES_AND_HEELS
 from bodyslam_jax.config import ContactTraining, MotionTraining
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.motion.capture.clips import FPS, Clip, interleave, padded, resample
-from bodyslam_jax.motion.capture.retarget import Trial, place
+from bodyslam_jax.motion.capture.clips import (
+    FPS,
+    Clip,
+    Trial,
+    interleave,
+    padded,
+    place,
+    resample,
+)
 from bodyslam_jax.motion.contact_network import (
     ContactModel,
     contact_features,

@@ -20,8 +20,7 @@ from jaxtyping import Array, Bool, Float
 from bodyslam_jax.body import BodyModel, local_joints
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
-from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
-from bodyslam_jax.motion.capture.retarget import Trial, place
+from bodyslam_jax.motion.capture.clips import FPS, Clip, Trial, place, resample
 from bodyslam_jax.motion.own_model import FunctionNetwork
 from bodyslam_jax.motion.paper_network import PaperNetwork
 from bodyslam_jax.motion.position_network import MetricNetwork

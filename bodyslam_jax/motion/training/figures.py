@@ -10,10 +10,8 @@ from jaxtyping import Float
 from bodyslam_jax.body import PARENTS, BodyModel, local_joints
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.markup import markdown_table
-from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
-from bodyslam_jax.motion.capture.retarget import place
-from bodyslam_jax.motion.continuation import Rollout
-from bodyslam_jax.motion.prediction import MotionModel
+from bodyslam_jax.motion.capture.clips import FPS, Clip, place, resample
+from bodyslam_jax.motion.prediction import MotionModel, Rollout
 from bodyslam_jax.motion.training.evaluation import (
     DRIFTS_DEG,
     TARGET_RATIOS,

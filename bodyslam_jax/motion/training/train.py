@@ -35,8 +35,7 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.io import atomic
 from bodyslam_jax.io.archive import read_npz
-from bodyslam_jax.motion.capture.clips import FPS, Clip, resample
-from bodyslam_jax.motion.capture.retarget import Trial, place
+from bodyslam_jax.motion.capture.clips import FPS, Clip, Trial, place, resample
 from bodyslam_jax.motion.network import (
     MotionNetwork,
     Normalisation,
