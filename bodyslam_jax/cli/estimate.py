@@ -1,6 +1,7 @@
 """`bodyslam run`, `demo` and `evaluate`."""
 
 import logging
+import shlex
 import webbrowser
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,11 @@ from bodyslam_jax.cli.options import Flat, Input, Preset
 from bodyslam_jax.config import Config
 
 log = logging.getLogger(__name__)
+
+_LONG_FRAMES = 3000
+"""Number of frames from which `run` tells what they take."""
+_GB_AT_ALL, _GB_PER_1000_FRAMES = 1.0, 0.8
+"""Memory of `run`, GB: 1.8 for 1,000 frames, 3.4 for 3,000 (`benchmarks/run.md`)."""
 
 
 def run(
@@ -66,6 +72,8 @@ def run(
     )
     out = out or default_folder(sequence)
     _announce(f"run: {input}, {sequence.num_frames} frames", out)
+    if sequence.num_frames >= _LONG_FRAMES:
+        log.warning(_about_length(input, sequence.num_frames))
     with unexpected.noted_in(out):
         return finish(pipeline.run_to_folder(sequence, out, config), out, open)
 
@@ -155,6 +163,22 @@ def evaluate(
         for line in evaluation.gaps(found.scope):
             log.warning(line)
     print(evaluation.to_json(found) if json else evaluation.to_table(found))
+
+
+def _about_length(input: Path, frames: int) -> str:
+    """Returns what a long input takes, and what there is instead."""
+    memory = _GB_AT_ALL + _GB_PER_1000_FRAMES * frames / 1000
+    text = (
+        f"{frames} frames take about {memory:.0f} GB of memory (at 640x480, one "
+        "person), and time in proportion; --start and --end choose some of them"
+    )
+    if not input.is_file():
+        return text
+    return (
+        f"{text}. `bodyslam live {shlex.quote(str(input))} --every-frame` needs 2 GB "
+        "whatever the length, and goes on after an interruption; it estimates one "
+        "person, a tenth to a third less exactly (docs/live.md)"
+    )
 
 
 def _announce(what: str, out: Path) -> None:
