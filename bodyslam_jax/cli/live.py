@@ -80,6 +80,8 @@ def live(
     from bodyslam_jax.pipeline.stage_cache import fingerprint
 
     _check(config)
+    # It has a line for each window.
+    logging.getLogger("bodyslam_jax.people.fit").setLevel(logging.WARNING)
     capture = Capture(source, config.fps, every=every_frame)
     with contextlib.ExitStack() as held:
         held.callback(capture.close)
