@@ -122,7 +122,7 @@ def test_a_state_calls_nothing_but_what_makes_arrays(tmp_path, caplog):
         Calls(bs.load_body_model, None),  # a function of this package
     ]
     for one in asked:
-        with gzip.open(path, "wb") as file:
+        with gzip.GzipFile(path, "wb") as file:
             pickle.dump({"name": one}, file)
         assert not checkpoint.resume(another(), path)
         assert "not of a state" in caplog.text
@@ -201,6 +201,7 @@ def test_a_long_video_is_told_what_it_takes(
 def rows_of(sequence: Sequence):
     """Time, keypoints and points of each frame."""
     tracks, keypoints = sequence.tracks, sequence.keypoints
+    assert tracks is not None and keypoints is not None
     for k, time in enumerate(sequence.timestamps):
         at = tracks.frame == k
         seen = keypoints.uv[:, k], keypoints.confidence[:, k, :, None]
