@@ -16,8 +16,9 @@ log = logging.getLogger(__name__)
 
 _LONG_FRAMES = 3000
 """Number of frames from which `run` tells what they take."""
-_GB_AT_ALL, _GB_PER_1000_FRAMES = 1.0, 0.8
-"""Memory of `run`, GB: 1.8 for 1,000 frames, 3.4 for 3,000 (`benchmarks/run.md`)."""
+_RUN_GB, _LIVE_GB = (1.0, 0.8), (1.5, 0.03)
+"""Memory of `run` and of `live --every-frame`, GB, and what 1,000 frames add
+(`benchmarks/run.md`, `online.md`)."""
 
 
 def run(
@@ -167,17 +168,17 @@ def evaluate(
 
 def _about_length(input: Path, frames: int) -> str:
     """Returns what a long input takes, and what there is instead."""
-    memory = _GB_AT_ALL + _GB_PER_1000_FRAMES * frames / 1000
+    of_run, of_live = (a + b * frames / 1000 for a, b in (_RUN_GB, _LIVE_GB))
     text = (
-        f"{frames} frames take about {memory:.0f} GB of memory (at 640x480, one "
+        f"{frames} frames take about {of_run:.0f} GB of memory (at 640x480, one "
         "person), and time in proportion; --start and --end choose some of them"
     )
     if not input.is_file():
         return text
     return (
-        f"{text}. `bodyslam live {shlex.quote(str(input))} --every-frame` needs 2 GB "
-        "whatever the length, and goes on after an interruption; it estimates one "
-        "person, a tenth to a third less exactly (docs/live.md)"
+        f"{text}. `bodyslam live {shlex.quote(str(input))} --every-frame` needs "
+        f"{of_live:.0f} GB, and goes on after an interruption; it estimates one person, "
+        "less exactly, and closes no loops (docs/live.md)"
     )
 
 
