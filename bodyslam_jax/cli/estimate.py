@@ -177,8 +177,8 @@ def _about_length(input: Path, frames: int) -> str:
         return text
     return (
         f"{text}. `bodyslam live {shlex.quote(str(input))} --every-frame` needs "
-        f"{of_live:.0f} GB, and goes on after an interruption; it estimates one person, "
-        "less exactly, and closes no loops (docs/live.md)"
+        f"{of_live:.0f} GB, and goes on after an interruption; it estimates one "
+        "person, less exactly, and closes no loops (docs/live.md)"
     )
 
 
