@@ -1,6 +1,7 @@
 """`bodyslam run`, `demo` and `evaluate`."""
 
 import logging
+import shlex
 import webbrowser
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,12 @@ from bodyslam_jax.cli.options import Flat, Input, Preset
 from bodyslam_jax.config import Config
 
 log = logging.getLogger(__name__)
+
+_LONG_FRAMES = 3000
+"""Number of frames from which `run` tells what they take."""
+_RUN_GB, _LIVE_GB = (1.0, 0.8), (1.5, 0.03)
+"""Memory of `run` and of `live --every-frame`, GB, and what 1,000 frames add
+(`benchmarks/run.md`, `online.md`)."""
 
 
 def run(
@@ -66,6 +73,8 @@ def run(
     )
     out = out or default_folder(sequence)
     _announce(f"run: {input}, {sequence.num_frames} frames", out)
+    if sequence.num_frames >= _LONG_FRAMES:
+        log.warning(_about_length(input, sequence.num_frames))
     with unexpected.noted_in(out):
         return finish(pipeline.run_to_folder(sequence, out, config), out, open)
 
@@ -155,6 +164,22 @@ def evaluate(
         for line in evaluation.gaps(found.scope):
             log.warning(line)
     print(evaluation.to_json(found) if json else evaluation.to_table(found))
+
+
+def _about_length(input: Path, frames: int) -> str:
+    """Returns what a long input takes, and what there is instead."""
+    of_run, of_live = (a + b * frames / 1000 for a, b in (_RUN_GB, _LIVE_GB))
+    text = (
+        f"{frames} frames take about {of_run:.0f} GB of memory (at 640x480, one "
+        "person), and time in proportion; --start and --end choose some of them"
+    )
+    if not input.is_file():
+        return text
+    return (
+        f"{text}. `bodyslam live {shlex.quote(str(input))} --every-frame` needs "
+        f"{of_live:.0f} GB, and goes on after an interruption; it estimates one "
+        "person, less exactly, and closes no loops (docs/live.md)"
+    )
 
 
 def _announce(what: str, out: Path) -> None:

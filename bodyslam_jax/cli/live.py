@@ -1,5 +1,7 @@
 """`bodyslam live`: the estimate while a video, a camera or a stream runs."""
 
+import contextlib
+import datetime
 import logging
 import time
 import webbrowser
@@ -22,6 +24,9 @@ _PICTURE_INTERVAL_S = 0.1
 """Least time between two pictures on the page, s."""
 _PROGRESS_INTERVAL_S = 5.0
 """Time between two lines of progress, s."""
+_STATE_INTERVAL_S, _MAX_STATE_SHARE = 60.0, 0.02
+"""Least time between two states of a file that is read with `--every-frame`, s, and
+largest share of the time that goes into writing them."""
 
 
 def live(
@@ -42,7 +47,8 @@ def live(
     """Estimates camera, people and map in metres while a video runs, until Ctrl-C.
 
     A page on this machine only shows picture and scene as they grow. At the end of the
-    source, or after Ctrl-C, the run folder is written; a second Ctrl-C gives up.
+    source, or after Ctrl-C, the run folder is written; a second Ctrl-C gives up. With
+    --every-frame Ctrl-C keeps the state, and the same command goes on.
 
     Args:
         source: Video file, which runs at its own pace; number of a camera (0); or
@@ -55,7 +61,8 @@ def live(
         open: Open the page in the default browser.
         every_frame: Read a file as fast as its frames are estimated, in place of its
             own pace: none is dropped, and the same file gives the same estimate. For
-            videos that are too long for `run`, as memory does not grow.
+            videos that are too long for `run`: it needs the memory of a window, and
+            goes on where it was interrupted.
         smooth: After the end estimate everything once more, offline, from the points
             and keypoints that were recorded; it takes as long as `run` without its
             images.
@@ -66,19 +73,26 @@ def live(
             --end, --height, --camera-path, --person) is refused.
     """
     from bodyslam_jax import export
-    from bodyslam_jax.cli.folders import free_folder
     from bodyslam_jax.io.camera.calibration import read_camera
     from bodyslam_jax.io.capture import Capture
     from bodyslam_jax.online import Online
     from bodyslam_jax.pipeline.progress import compiling
+    from bodyslam_jax.pipeline.stage_cache import fingerprint
 
     _check(config)
+    # It has a line for each window.
+    logging.getLogger("bodyslam_jax.people.fit").setLevel(logging.WARNING)
     capture = Capture(source, config.fps, every=every_frame)
-    try:
+    with contextlib.ExitStack() as held:
+        held.callback(capture.close)
         intrinsics = None if camera is None else read_camera(camera, capture.size)[0]
         name = _name(source)
-        out = out or free_folder(name)
+        key = None
+        if every_frame:
+            key = fingerprint(capture.path, capture.fps, intrinsics, smooth, config)
+        out = out or _folder(name, key)
         export.check_folder(out, {"name": name}, None)
+        held.enter_context(export.locked(out))
         online = Online(
             config,
             intrinsics=intrinsics,
@@ -91,28 +105,86 @@ def live(
         width, height = capture.size
         with compiling("live", f"{width}x{height} px"):
             online.prepare(capture.size)
+        states = None if key is None else _States(online, _state_file(out, key))
+        if states is not None:
+            export.clear_partial(out)
+            states.resume(capture)
         shown = _page(page, port, open)
-        try:
-            with interrupts.as_event() as stop:
-                indices = _follow(capture, online, shown, stop)
-        finally:
-            if shown is not None:
-                shown.close()
-    finally:
-        capture.close()
-    if capture.dropped:
-        online.warn(
-            f"{capture.dropped} of {capture.dropped + len(indices)} frames were "
-            "dropped: newer ones came before they were used"
-        )
-    if capture.path is not None:
-        online.video, online.picks = capture.path, indices
-    with unexpected.noted_in(out):
-        result = online.finish()
-        if smooth:
-            result = _smoothed(online, result)
-        _write_folder(online, result, out)
+        if shown is not None:
+            held.callback(shown.close)
+        with interrupts.as_event() as stop:
+            indices = _follow(capture, online, shown, stop, states)
+        if states is not None and stop.is_set():
+            states.save()
+            raise KeyboardInterrupt
+        if capture.dropped:
+            online.warn(
+                f"{capture.dropped} of {capture.dropped + len(indices)} frames were "
+                "dropped: newer ones came before they were used"
+            )
+        if capture.path is not None:
+            online.video, online.picks = capture.path, indices
+        with unexpected.noted_in(out):
+            result = online.finish()
+            if smooth:
+                result = _smoothed(online, result)
+            _write_folder(online, result, out)
+        if states is not None:
+            states.remove()
     return finish(result, out)
+
+
+def _folder(name: str, key: str | None) -> Path:
+    """Returns a new folder for a run, or that of an interrupted one with the same
+    `key`."""
+    from bodyslam_jax.cli.folders import free_folder
+
+    if key is None:
+        return free_folder(name)
+    return free_folder(name, lambda folder: _state_file(folder, key).is_file())
+
+
+def _state_file(out: Path, key: str) -> Path:
+    """Returns the file of the estimate's state, for one input and its settings."""
+    return out / ".cache" / f"live-{key}.state"
+
+
+class _States:
+    """The state of an estimate that is written every now and then."""
+
+    def __init__(self, online: Any, path: Path) -> None:
+        self.online, self.path = online, path
+        self.written, self.took = time.monotonic(), 0.0
+
+    def resume(self, capture: Any) -> None:
+        """Goes on where an earlier process wrote the state, if one did."""
+        from bodyslam_jax.online import checkpoint
+
+        if checkpoint.resume(self.online, self.path):
+            frames = self.online.counts.frames
+            log.info("live: goes on after frame %d, where it was interrupted", frames)
+            capture.skip(frames)
+
+    def save_at_times(self) -> None:
+        """Writes the state, if that was done long enough ago."""
+        since = time.monotonic() - self.written
+        if since >= max(_STATE_INTERVAL_S, self.took / _MAX_STATE_SHARE):
+            self.save()
+
+    def save(self) -> None:
+        from bodyslam_jax.online import checkpoint
+
+        begun = time.monotonic()
+        checkpoint.save(self.online, self.path)
+        self.written = time.monotonic()
+        self.took = self.written - begun
+
+    def remove(self) -> None:
+        """Removes the file, and the states of other settings."""
+        for path in self.path.parent.glob("live-*.state"):
+            path.unlink()
+        with contextlib.suppress(OSError):  # It may be the cache of a run, too.
+            self.path.parent.rmdir()
 
 
 def _smoothed(online: Any, result: Any) -> Any:
@@ -134,6 +206,8 @@ def _write_folder(online: Any, result: Any, out: Path) -> None:
     """Writes what `online.finish` returned as `run` does; with an overlay where the
     frames are those of a file (`Online.video`), as no image is kept.
 
+    The caller holds the folder's lock.
+
     **Raises:** `InputError` if `out` cannot be written or holds something else.
     """
     from bodyslam_jax import export
@@ -142,7 +216,7 @@ def _write_folder(online: Any, result: Any, out: Path) -> None:
 
     check_overlay(online.config)
     watch = Stopwatch()
-    with export.locked(out), export.run_folder(out) as partial:
+    with export.run_folder(out) as partial:
         measured, cameras = online.inputs
         given = measured, cameras, result, online.body, online.config, watch
         still = write_pictures(partial, *given)
@@ -177,13 +251,18 @@ def _page(wanted: bool, port: int, open: bool) -> Any:
     return page
 
 
-def _follow(capture: Any, online: Any, page: Any, stop: Any) -> list[int]:
+def _follow(
+    capture: Any, online: Any, page: Any, stop: Any, states: _States | None
+) -> list[int]:
     """Passes images to the estimate until the source ends or the user stops it; returns
-    the numbers of these images in the source."""
-    indices: list[int] = []
+    the numbers of all images in the source that it was given, also by an earlier
+    process."""
+    indices = list(range(capture.skipped))
     latencies: list[float] = []
     told, drawn, begun = 0.0, 0.0, time.monotonic()
     silent = False
+    if capture.every:
+        log.info("live ...", extra={"stage": "live"})
     capture.start()
     while not stop.is_set():
         found = capture.newest(timeout=0.5)
@@ -205,11 +284,15 @@ def _follow(capture: Any, online: Any, page: Any, stop: Any) -> list[int]:
         indices.append(found.index)
         latencies = [*latencies[-99:], estimate.latency]
         late = sorted(latencies)[int(0.95 * (len(latencies) - 1))]
-        rate = len(indices) / max(now - begun, 1e-9)
+        here = len(indices) - capture.skipped
+        rate = here / max(now - begun, 1e-9)
         figures = _figures(estimate, rate, late, capture.dropped)
+        done = {}
         if capture.every and capture.length is not None:
-            left = max(capture.length - len(indices), 0) / max(rate, 1e-9)
-            figures["time left"] = f"{left:.0f} s"
+            total = max(capture.length - capture.skipped, here)
+            left = round((total - here) / max(rate, 1e-9))
+            figures["time left"] = str(datetime.timedelta(seconds=left))
+            done = {"stage": "live", "done": here, "total": total}
         if page is not None and now - drawn >= _PICTURE_INTERVAL_S:
             drawn = now
             page.show(
@@ -221,7 +304,10 @@ def _follow(capture: Any, online: Any, page: Any, stop: Any) -> list[int]:
             )
         if now - told >= _PROGRESS_INTERVAL_S:
             told = now
-            log.info(", ".join(f"{k} {v}" for k, v in figures.items()))
+            line = ", ".join(f"{k} {v}" for k, v in figures.items())
+            log.info(line, extra=done)
+        if states is not None:
+            states.save_at_times()
     return indices
 
 

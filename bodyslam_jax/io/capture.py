@@ -73,6 +73,8 @@ class Capture:
         told = float(self.reader.get(cv2.CAP_PROP_FRAME_COUNT) or 0.0)
         self.length = int(told) if self.path is not None and told > 0 else None
         """Number of images of a file, as its header tells it."""
+        self.skipped = 0
+        """Images of a file that `skip` passed over."""
         self.dropped = 0
         """Images that were replaced by newer ones before anybody took them."""
         self.ended = False
@@ -83,6 +85,17 @@ class Capture:
         self._ready = threading.Condition()
         self._closed = False
         self._thread: threading.Thread | None = None
+
+    def skip(self, images: int) -> None:
+        """Passes over the first images of a file, before `start`."""
+        if not images:
+            return
+        # Reading is exact, whereas seeking depends on the file's index.
+        for _ in range(images - 1):
+            self.reader.grab()
+        ok, image = self.reader.read()
+        self.first = image if ok else None
+        self.skipped = images
 
     def start(self) -> None:
         """Begins to read; the source's time begins now."""
@@ -129,7 +142,7 @@ class Capture:
 
     def _read(self) -> None:
         begun = time.monotonic()
-        index, image = 0, self.first
+        index, image = self.skipped, self.first
         self.first = None
         while image is not None and not self._closed:
             timestamp = index / self.fps

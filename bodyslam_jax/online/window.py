@@ -7,8 +7,10 @@ prior, and it moves on by ten frames.
 
 import dataclasses
 import time
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,6 +18,7 @@ from jaxtyping import Bool, Float
 from bodyslam_jax import graph, initialisation, solver
 from bodyslam_jax.diagnostics.scale_uncertainty import inflate_fitted_shapes
 from bodyslam_jax.diagnostics.statistics import stature_and_sigma
+from bodyslam_jax.geometry.lengths import put
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.motion import leg_length
@@ -195,7 +198,7 @@ class Window(Content):
         tracks = problem.factors[0]
         assert isinstance(tracks, graph.Reprojection)
         self._measure_pixels(tracks, np.asarray(state.landmarks))
-        self.problem, self.state = problem, state
+        self.problem, self.state = _strong(problem), _strong(state)
         self.told = told
 
     def _measure_pixels(
@@ -266,6 +269,13 @@ class Window(Content):
             seconds=seconds,
             fixed=self.fixed,
         )
+
+
+def _strong(tree: Any) -> Any:
+    """Returns arrays whose type JAX had weakened (of Python's numbers) with that type,
+    as they are when they come from a file: a program is compiled for each kind."""
+    weak = lambda x: isinstance(x, jax.Array) and x.weak_type
+    return jax.tree.map(lambda x: put(x) if weak(x) else x, tree)
 
 
 @eqx.filter_jit

@@ -6,6 +6,7 @@ camera that lost all points can be located again. Memory does not grow.
 """
 
 import dataclasses
+import functools
 from collections import deque
 
 import cv2
@@ -71,8 +72,12 @@ class PointFollower:
             maxlen=_RIGID_FRAMES + 1
         )
         self.next_id = 0
-        self.orb = cv2.ORB.create(_NUM_FEATURES)
         self.places: deque[Place] = deque(maxlen=_MAX_PLACES)
+
+    @property
+    def orb(self) -> cv2.ORB:
+        """The detector of corners, which has no state."""
+        return _orb()
 
     def advance(
         self, gray: UInt8[np.ndarray, "y x"], mask: UInt8[np.ndarray, "y x"] | None
@@ -197,6 +202,11 @@ class PointFollower:
             distance=0.15 * cell,
         )[: max(0, self.wanted - len(self.ids))]
         self.add(uv[chosen])
+
+
+@functools.cache
+def _orb() -> cv2.ORB:
+    return cv2.ORB.create(_NUM_FEATURES)
 
 
 def _flow(
