@@ -211,8 +211,8 @@ def _write_folder(online: Any, result: Any, out: Path) -> None:
     **Raises:** `InputError` if `out` cannot be written or holds something else.
     """
     from bodyslam_jax import export
-    from bodyslam_jax.pipeline.run_folder import check_overlay, write_pictures
     from bodyslam_jax.pipeline.progress import Stopwatch
+    from bodyslam_jax.pipeline.run_folder import check_overlay, write_pictures
 
     check_overlay(online.config)
     watch = Stopwatch()
