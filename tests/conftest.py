@@ -59,6 +59,13 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
 
 
+def pytest_collection_finish():
+    """What is imported by now stays: a collection of garbage, of which each file ends
+    with one, takes 0.4 s of half a million objects that are never freed."""
+    gc.collect()
+    gc.freeze()
+
+
 def drop_programs() -> None:
     """Frees compiled programs and what was traced for them, and gives their memory
     back to the system: it would seem used after the next test, too."""
