@@ -1,5 +1,6 @@
 """Progress of a run as lines, JSON or a bar, and completion in real shells."""
 
+import contextlib
 import io
 import json
 import logging
@@ -160,6 +161,18 @@ def test_general_options_are_taken_from_any_place():
     PACKAGE.setLevel(level)
 
 
+@pytest.fixture(scope="module")
+def completion():
+    """The script of `bodyslam completion bash`."""
+    out = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):
+        patch.setattr(sys, "argv", ["bodyslam", "completion", "bash"])
+        patch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
+        with pytest.raises(SystemExit):
+            main()
+    return out.getvalue()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "typed, expected, refused",
@@ -170,20 +183,13 @@ def test_general_options_are_taken_from_any_place():
         ("bodyslam body-model convert --qu", "--quiet", "--detect"),
     ],
 )
-def test_bash_completes_commands_and_options(
-    monkeypatch, capsys, typed, expected, refused
-):
+def test_bash_completes_commands_and_options(completion, typed, expected, refused):
     bash = shutil.which("bash")
     if bash is None:
         pytest.skip("bash is not installed")
-    monkeypatch.setattr(sys, "argv", ["bodyslam", "completion", "bash"])
-    monkeypatch.setattr("bodyslam_jax.cli.jax_setup.prepare", lambda device: None)
-    with pytest.raises(SystemExit):
-        main()
-    script = capsys.readouterr().out
     words = typed.split(" ")
     given = " ".join(f"'{word}'" for word in words)
-    script += (
+    script = completion + (
         f"COMP_WORDS=({given}); COMP_CWORD={len(words) - 1}; _bodyslam; "
         'printf "%s\\n" "${COMPREPLY[@]}"'
     )

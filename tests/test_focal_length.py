@@ -33,11 +33,18 @@ def test_a_guess_off_by_a_fifth_is_corrected():
     assert camera_error(found.T_WC, truth) < 0.03
 
 
-@pytest.mark.parametrize(("error", "kind"), [(1.0, "moving"), (0.4, "rotation")])
-def test_turning_is_believed_only_if_it_explains_the_images(monkeypatch, error, kind):
-    """A map that fits to 0.3 px, and with a better focal length none, but turning."""
+@pytest.fixture(scope="module")
+def orbit():
     tracks, _ = scene("orbit", num=NUM)
-    first = reconstruct(tracks, CAMERA, NUM)
+    return tracks, reconstruct(tracks, CAMERA, NUM)
+
+
+@pytest.mark.parametrize(("error", "kind"), [(1.0, "moving"), (0.4, "rotation")])
+def test_turning_is_believed_only_if_it_explains_the_images(
+    monkeypatch, orbit, error, kind
+):
+    """A map that fits to 0.3 px, and with a better focal length none, but turning."""
+    tracks, first = orbit
     turning = dataclasses.replace(first, kind="rotation", error=error)
     monkeypatch.setattr(sfm_stage, "reconstruct", lambda *_: turning)
 

@@ -83,11 +83,10 @@ def test_a_long_walk_is_no_zoom():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ratio", [0.75, 4 / 3])
-def test_pixels_that_are_not_square_are_seen_in_the_tracks(ratio):
+def test_pixels_that_are_not_square_are_seen_in_the_tracks():
     """They are used, or said with their figures where the odds do not suffice: here
     focal length and aspect ratio are known together better than each alone."""
-    tracks, truth = scene("orbit", seed=3)
+    (tracks, truth), ratio = scene("orbit", seed=3), 4 / 3
     model = model_of(about_centre(tracks, np.array([ratio, 1.0])), GUESS)
     (said,) = [re.search(r"fx/fy = ([\d.]+)", text) for text in model.warnings]
     assert said is not None

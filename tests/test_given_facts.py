@@ -138,9 +138,9 @@ def test_the_estimate_without_a_stature_is_the_one_that_never_had_it(body, sized
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.65, 0.8])
-def test_a_child_of_a_given_stature_is_as_tall_and_the_path_as_long(share):
+def test_a_child_of_a_given_stature_is_as_tall_and_the_path_as_long():
     """The world of a walk at a share of its size: no measurement tells it but time."""
+    share = 0.65
     simulated = simulation.simulate(
         Simulation(sequence="M1", family="follow", length=60, noise="low")
     )

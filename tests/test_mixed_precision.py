@@ -145,11 +145,10 @@ def test_a_baseline_has_one_precision():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factor", [0.1, 10.0])
-def test_people_and_a_scale_ten_times_off(factor):
+def test_people_and_a_scale_ten_times_off():
     problem, _, start = make(frames=12, people=1)
     best = solve(problem, start, schedule=TIGHT)
-    off = eqx.tree_at(lambda s: s.scale, start, factor * start.scale)
+    off = eqx.tree_at(lambda s: s.scale, start, 0.1 * start.scale)
     found = mixed(problem, off)
     assert float(found.cost) == pytest.approx(float(best.cost), rel=1e-6)
     assert float(found.state.scale) == pytest.approx(float(best.state.scale), rel=1e-3)

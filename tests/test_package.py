@@ -34,24 +34,27 @@ def _imported(module: Path) -> set[str]:
     return found
 
 
-IMPORTED = {name for m in PACKAGE.rglob("*.py") for name in _imported(m)}
+@pytest.fixture(scope="module")
+def imported() -> set[str]:
+    """Names of all modules that the package imports."""
+    return {name for m in PACKAGE.rglob("*.py") for name in _imported(m)}
 
 
 def _name(requirement: str) -> str:
     return re.split(r"[<>=\[ ;]", requirement)[0].lower()
 
 
-def test_every_import_is_declared():
+def test_every_import_is_declared(imported):
     extras = PROJECT["optional-dependencies"]
     groups = [extras[name] for name in ("usd", "rerun", "video", "ray", "slurm")]
     declared = {_name(r) for r in sum(groups, PROJECT["dependencies"])}
-    tops = {name.split(".")[0] for name in IMPORTED} - set(sys.stdlib_module_names)
+    tops = {name.split(".")[0] for name in imported} - set(sys.stdlib_module_names)
     needed = {DISTRIBUTION.get(t, t).lower() for t in tops - {"bodyslam_jax"}}
     assert needed <= declared, needed - declared
 
 
-def test_what_is_used_by_private_names_has_an_upper_bound():
-    private = {n.split(".")[0] for n in IMPORTED if re.search(r"\._[a-z]", n)}
+def test_what_is_used_by_private_names_has_an_upper_bound(imported):
+    private = {n.split(".")[0] for n in imported if re.search(r"\._[a-z]", n)}
     private -= {"bodyslam_jax"}
     assert private == {"jax"}
     for name in private:

@@ -222,12 +222,13 @@ def test_a_single_frame_and_none_that_changes(truth, body):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("jitter", [1.0, 3.6])
-def test_of_forty_jittery_sequences_nobody_is_turned_round(body, jitter):
-    """As `simulate` makes them: 3.6 times the usual jitter is 68 m/s^2."""
+def test_of_forty_jittery_sequences_nobody_is_turned_round(body):
+    """As `simulate` makes them, every other four with 3.6 times the usual jitter, 68
+    m/s^2."""
     kinds = (("E2", "follow"), ("M1", "follow"), ("M2", "room"), ("D1", "room"))
     for seed in range(40):
         name, family = kinds[seed % 4]
+        jitter = 3.6 if seed // 4 % 2 else 1.0
         settings = Simulation(
             sequence=name, family=family, length=90, seed=seed, body_jitter=jitter
         )

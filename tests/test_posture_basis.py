@@ -73,14 +73,6 @@ def test_a_basis_that_is_none_is_refused(basis, message):
 
 
 @pytest.mark.slow
-def test_a_full_basis_gives_the_steps_of_all_turns():
-    problem, state, _ = make(1, frames=12, people=1, extras=True, some_held=True)
-    expected, _ = ravel_pytree(one_step(problem, state))
-    found, _ = ravel_pytree(one_step(with_basis(problem, np.eye(69)), state))
-    assert abs(found - expected).max() < 1e-11 * abs(expected).max()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("past", [0, 10])
 def test_steps_are_those_of_dense_equations_in_the_basis(past):
     """Of a whole problem, and of what a prior of its first frames stands for."""

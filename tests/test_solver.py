@@ -109,7 +109,7 @@ def last(monkeypatch, count):
         {"frames": 12, "people": 1},
         # Long tracks: a chunk shares landmarks with several others.
         pytest.param(
-            {"frames": 43, "people": 1, "landmarks": 40, "length": 40},
+            {"frames": 33, "people": 1, "landmarks": 40, "length": 30},
             marks=pytest.mark.slow,
         ),
         pytest.param(
@@ -118,7 +118,7 @@ def last(monkeypatch, count):
         ),
         # Without postures, and without anything that ties a person's frames.
         pytest.param(
-            {"frames": 23, "people": 2, "held": "poses"}, marks=pytest.mark.slow
+            {"frames": 13, "people": 2, "held": "poses"}, marks=pytest.mark.slow
         ),
         pytest.param(
             {"frames": 12, "people": 1, "without": g.HumanMotion},
@@ -507,14 +507,10 @@ def test_single_precision_serves_people_and_covariances_too():
             {"people": 1, "frames": 12, "at": "truth"}, marks=pytest.mark.slow
         ),
         pytest.param(
-            {"frames": 43, "people": 1, "landmarks": 60, "far": 8, "again": True},
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
             {"frames": 13, "people": 2, "landmarks": 60}, marks=pytest.mark.slow
         ),
         pytest.param(
-            {"frames": 43, "people": 1, "landmarks": 60, "length": 40},
+            {"frames": 33, "people": 1, "landmarks": 60, "length": 30},
             marks=pytest.mark.slow,
         ),
     ],

@@ -112,7 +112,7 @@ def test_simulated_cases_are_built_stacked_and_compared_with_their_truths():
         (case.trajectories(of(found.state, k)), case.truth)
         for k, case in enumerate(made)
     ]
-    errors = jax.vmap(bs.evaluate)(*bs.stack_pairs(pairs))
+    errors = jax.jit(jax.vmap(bs.evaluate))(*bs.stack_pairs(pairs))
     assert (np.asarray(errors["j_ate_sim3"]) < 0.3).all()
     for k, case in enumerate(made):
         alone = bs.solve(*bs.build(case, hold=("cameras", "landmarks")))

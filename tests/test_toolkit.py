@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 import scenes
 from jaxtyping import Array, Float
@@ -190,13 +189,15 @@ def test_weights_that_cannot_be_are_refused(built, weights, message):
 @pytest.mark.slow
 def test_the_cost_by_term_is_a_differentiable_sum(built):
     problem, state = built
-    terms = problem.cost_by_term(state)
-    np.testing.assert_allclose(sum(terms.values()), problem.cost(state))
-    slope = jax.grad(lambda s: problem.cost_by_term(s)["human_motion"])(state)
+    terms, cost = terms_of(problem, state), jax.jit(lambda s: problem.cost(s))
+    np.testing.assert_allclose(sum(terms.values()), cost(state))
+    of_term = lambda s: problem.cost_by_term(s)["human_motion"]
+    slope = jax.jit(jax.grad(of_term))(state)
     assert np.isfinite(slope.scale) and slope.scale != 0
     cost_of = lambda lam: bs.with_weights(problem, human_motion=lam).cost(state)
     expected = terms["human_motion"] / bs.weights(problem)["human_motion"]
-    np.testing.assert_allclose(jax.grad(cost_of)(2.0), expected, rtol=1e-9)
+    found = jax.jit(jax.grad(cost_of))(2.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 FACTORS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
@@ -304,7 +305,7 @@ def test_factors_of_ones_own_are_rescaled_if_they_say_how(built):
 
 def test_the_scale_is_the_same_from_maps_of_all_sizes(built, solution):
     """Section 4.2 of the paper, with the ground and the landmarks in the cost."""
-    for factor in FACTORS:
+    for factor in (FACTORS[0], FACTORS[2], FACTORS[-1]):
         found = bs.solve(*bs.rescaled(*built, factor))
         assert found.status == "converged"
         answer = found.state.scale * factor
@@ -315,11 +316,11 @@ def test_the_scale_is_the_same_from_maps_of_all_sizes(built, solution):
 def test_the_scale_is_the_same_with_cameras_and_map_free():
     """And in the other family; `benchmarks/bench_rescaled.py` has other lengths."""
     built = bs.build(bs.simulate_case("M2", family="room", frames=60))
-    factors = (0.1, 1.0, 5.0)
+    factors = (0.1, 5.0)
     found = [bs.solve(*bs.rescaled(*built, factor)) for factor in factors]
     assert {x.status for x in found} == {"converged"}
     answers = [float(x.state.scale) * f for x, f in zip(found, factors, strict=True)]
-    np.testing.assert_allclose(answers, answers[1], rtol=1e-6)
+    np.testing.assert_allclose(answers[0], answers[1], rtol=1e-6)
 
 
 def test_of_several_scales_the_best_is_taken_from_all_starts():
@@ -343,20 +344,6 @@ def test_a_better_scale_that_is_known_is_said(solution):
 
 
 @pytest.mark.slow
-def test_a_position_sensor_determines_the_scale(built):
-    problem, state = built
-    factor = positions(state)
-    report = bs.check_factor(factor, state)
-    assert report.residual_shape == (FRAMES, 3)
-    more = problem.with_factors(factor)
-    assert more.names[-1] == "camera_position"
-    assert bs.weights(more)["camera_position"] == pytest.approx(1e4)
-    solution = bs.solve(more, state)
-    assert solution.status == "converged"
-    np.testing.assert_allclose(solution.state.scale, 2.0, rtol=0.01)
-
-
-@pytest.mark.slow
 def test_a_known_stature_is_counted_once(case, built):
     _, state = built
     factor = stature(case.body, state)
@@ -368,12 +355,33 @@ def test_a_known_stature_is_counted_once(case, built):
 
 
 @pytest.mark.slow
-def test_a_known_stature_decides_the_shape(case, built):
+def test_a_sensor_determines_the_scale_and_a_known_stature_the_shape(case, built):
     problem, state = built
-    factor = stature(case.body, state)
-    found = bs.solve(problem.with_factors(factor), state).state.shapes[0]
-    rest = case.body.template[:, 1] + case.body.shape_dirs[:, 1] @ found
-    np.testing.assert_allclose(np.ptp(np.asarray(rest)), 1.8, atol=5e-3)
+    sensor = positions(state)
+    assert bs.check_factor(sensor, state).residual_shape == (FRAMES, 3)
+
+    def solved(sensor_sigma, height, height_sigma):
+        """A measurement whose sigma is infinite is missing: one program for all."""
+        own = positions(state, sigma=sensor_sigma)
+        more = problem.with_factors(
+            own, stature(case.body, state, height, sigma=height_sigma)
+        )
+        assert more.names[-2:] == ["camera_position", "known_stature"]
+        return bs.solve(more, state)
+
+    weights = bs.weights(problem.with_factors(sensor))
+    assert weights["camera_position"] == pytest.approx(1e4)
+    found = solved(0.01, 1.8, np.inf)
+    assert found.status == "converged"
+    assert float(found.state.scale) == pytest.approx(2.0, rel=0.01)
+    scales = []
+    for height in (1.65, 1.95):
+        found = solved(np.inf, height, 1e-3).state
+        rest = case.body.template[:, 1] + case.body.shape_dirs[:, 1] @ found.shapes[0]
+        np.testing.assert_allclose(np.ptp(np.asarray(rest)), height, atol=5e-3)
+        scales.append(float(found.scale))
+    # Larger people in the same pixels are farther away, and the map is larger.
+    assert scales[0] < scales[1]
 
 
 @pytest.mark.slow
@@ -444,47 +452,6 @@ def test_shapes_that_do_not_fit_are_refused_by_name(built):
         bs.check_factor(short, state)
 
 
-@pytest.mark.slow
-def test_a_prior_of_ones_own_pulls_the_optimum(built, solution):
-    """A weak belief about the size of people, on each person's β_0, once."""
-
-    class TallPeople(bs.FrameFactor):
-        size: Float[Array, " h"]
-        keys = (("shape", 0),)
-
-        def frame_residual(self, data, window, shared):
-            return (shared.shape[:1] - data[0]) / 0.01
-
-    problem, state = built
-    prior = TallPeople(jnp.full(len(state.shapes), 2.0))
-    found = bs.solve(problem.with_factors(prior), solution.state).state
-    np.testing.assert_allclose(found.shapes[:, 0], 2.0, atol=0.1)
-    # Larger people in the same pixels are farther away, and the map is larger.
-    assert found.scale > solution.state.scale
-
-
-@pytest.mark.slow
-def test_a_motion_model_of_ones_own_is_a_function_and_parameters(built):
-    problem, state = built
-    default = problem.motion.predict
-
-    def shorter_steps(parameters, *of_person):
-        model, factor = parameters
-        found = default(model, *of_person)
-        return dataclasses.replace(found, translation=factor * found.translation)
-
-    scales = [
-        float(bs.solve(other, state).state.scale)
-        for factor in (1.0, 1.5)
-        for other in [
-            problem.with_motion_model(
-                shorter_steps, (problem.motion.model, jnp.asarray(factor))
-            )
-        ]
-    ]
-    assert scales[1] > 1.02 * scales[0]
-
-
 def test_a_state_is_saved_and_loaded(solution, tmp_path):
     state = solution.state
     np.savez(tmp_path / "state.npz", **vars(state))
@@ -495,36 +462,6 @@ def test_a_state_is_saved_and_loaded(solution, tmp_path):
     assert eqx.tree_equal(
         eqx.tree_deserialise_leaves(tmp_path / "state.eqx", state), state
     )
-
-
-@pytest.mark.slow
-def test_optax_lowers_the_raw_cost(built):
-    problem, state = built
-    with jax.numpy_dtype_promotion("standard"):
-        method = optax.adam(1e-3)
-        step, memory = state.zero_step(), method.init(state.zero_step())
-
-        @jax.jit
-        def descend(step, memory):
-            cost = lambda x: problem.cost(
-                state.retract(jax.tree.map(jnp.multiply, x, problem.free))
-            )
-            value, slope = jax.value_and_grad(cost)(step)
-            change, memory = method.update(slope, memory)
-            return optax.apply_updates(step, change), memory, value
-
-        costs = []
-        for _ in range(20):
-            step, memory, cost = descend(step, memory)
-            costs.append(float(cost))
-    assert costs[-1] < costs[0]
-
-
-@pytest.mark.slow
-def test_solvers_are_selected_by_name(built):
-    problem, state = built
-    solution = bs.solve(problem, state, solver="adam")
-    assert solution.cost < cost_of(problem, state)
 
 
 @pytest.mark.parametrize("solver", ["optimistix_lm", "jaxopt_lm"])
