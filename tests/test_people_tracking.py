@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from bodyslam_jax.body.skeleton import COCO17_MIRRORED
 from bodyslam_jax.people.linking import link, remarks
 from bodyslam_jax.people.movenet import MOVENET_POINTS
 from bodyslam_jax.people.phantoms import is_phantom
@@ -157,6 +158,42 @@ def test_a_jump_is_somebody_else_and_is_said(change):
     assert [{name for _, name in p} for p in people] == [{0}, {1}]
     assert "person 1 begins in frame 40" in said[0]
     assert "taken for somebody else" in said[0]
+
+
+def test_who_stays_in_place_is_not_moved_on_so_that_everybody_has_a_detection():
+    """Of two side by side one goes, and somebody comes on the other side of the other:
+    all detections could continue a track, each of a neighbour."""
+    tracker = Tracker(30.0, 0.7, MOVENET_POINTS)
+    for k in range(20):
+        tracker.update(k, np.stack([standing(100), standing(132)]))
+    assert tracker.update(20, np.stack([standing(132), standing(165)])).tolist() == [
+        1,
+        2,
+    ]
+
+
+@pytest.mark.parametrize("fps", [10.0, 30.0])
+def test_sides_that_a_detector_exchanges_are_of_the_same_person(fps):
+    """Two walk past each other; of one, left and right are exchanged now and then."""
+    tracker = Tracker(fps, 0.7, MOVENET_POINTS)
+    for k in range(round(3 * fps)):
+        points = np.stack([standing(100 + 90 * k / fps), standing(400 - 90 * k / fps)])
+        if k % 4 == 3:
+            points[0] = points[0, list(COCO17_MIRRORED)]
+        assert sorted(tracker.update(k, points).tolist()) == [0, 1]
+    assert np.ptp([p[:, 0].mean() for p in tracker.tracklets[0].points]) > 200
+
+
+def test_a_half_hidden_person_keeps_size_and_place():
+    """Only the feet are seen for a while, and then the head."""
+    tracker = Tracker(30.0, 0.7, MOVENET_POINTS)
+    for k in range(30):
+        points = standing(100 + 3 * k)
+        if 10 <= k < 20:
+            points[slice(0, 13) if k < 15 else slice(5, 17), 2] = 0.0
+        assert tracker.update(k, points[None]).tolist() == [0]
+    whole = tracker.tracklets[0].expected(30)
+    np.testing.assert_allclose(whole[:, :2], standing(190)[:, :2], atol=1.0)
 
 
 def test_a_gap_is_filled_on_a_line():
