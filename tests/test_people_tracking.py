@@ -9,7 +9,7 @@ from bodyslam_jax.people.movenet import MOVENET_POINTS
 from bodyslam_jax.people.phantoms import is_phantom
 from bodyslam_jax.people.regions import behind, regions
 from bodyslam_jax.tracking.appearance import describe, difference, mean_look
-from bodyslam_jax.tracking.tracker import Tracker, Tracklet, between
+from bodyslam_jax.tracking.tracker import PointSet, Tracker, Tracklet, between
 
 # COCO's 17 keypoints of somebody who stands, in units of the height.
 STANDING = np.array(
@@ -186,7 +186,7 @@ def test_sides_that_a_detector_exchanges_are_of_the_same_person(fps):
 
 def test_a_half_hidden_person_keeps_size_and_place():
     """Only the feet are seen for a while, and then the head."""
-    tracker = Tracker(30.0, 0.7, MOVENET_POINTS)
+    tracker = Tracker(30.0, 0.7, PointSet(0.15))
     for k in range(30):
         points = standing(100 + 3 * k)
         if 10 <= k < 20:

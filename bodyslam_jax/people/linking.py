@@ -15,7 +15,6 @@ from bodyslam_jax.people.movenet import height
 from bodyslam_jax.people.regions import behind
 from bodyslam_jax.tracking.appearance import difference, mean_look
 from bodyslam_jax.tracking.tracker import (
-    GATE_HEIGHTS,
     LONG_GAP_FRAMES,
     MAX_SIZE_RATIO,
     Tracklet,
@@ -24,9 +23,10 @@ from bodyslam_jax.tracking.tracker import (
 
 _SHORT_GAP_S = 1.0
 """Gap up to which the position in the image is compared."""
-_GATE_GROWTH_HEIGHTS_PER_S = 1.2
-"""Growth of the gate on the distance from the predicted position with time, relative to
-the person's height: twice the tracker's, as colours must agree more closely."""
+_GATE_HEIGHTS, _GATE_GROWTH_HEIGHTS_PER_S = 0.3, 1.2
+"""Gate on the distance from the predicted position, relative to the person's height,
+and its growth with time. Both are twice the tracker's or nearly so, as colours must
+agree more closely (`benchmarks/video.md`)."""
 _MAX_COLOUR_DIFFERENCE = 14.0
 """Difference of colours up to which a person after a long gap is the same."""
 _MAX_NEARBY_COLOUR_DIFFERENCE = 22.0
@@ -171,7 +171,7 @@ def join_cost(a: Tracklet, b: Tracklet) -> float:
     if seconds > _SHORT_GAP_S:
         clothes = looks / _MAX_COLOUR_DIFFERENCE if np.isfinite(looks) else np.inf
         return float(max(clothes, growth)) if max(clothes, growth) < 1 else np.inf
-    place = _apart(a, b) / (GATE_HEIGHTS + _GATE_GROWTH_HEIGHTS_PER_S * seconds)
+    place = _apart(a, b) / (_GATE_HEIGHTS + _GATE_GROWTH_HEIGHTS_PER_S * seconds)
     clothes = looks / _MAX_NEARBY_COLOUR_DIFFERENCE if np.isfinite(looks) else 0.5
     worst = max(place, clothes, growth)
     return float(0.5 * place + 0.5 * clothes) if worst < 1 else np.inf

@@ -144,7 +144,7 @@ MIN_SURE_SCORE = 0.15
 person's height (`found.confidence`)."""
 
 
-MOVENET_POINTS = PointSet(MIN_SURE_SCORE, COCO17_MIRRORED)
+MOVENET_POINTS = PointSet(MIN_SURE_SCORE, COCO17_MIRRORED, remembered=False)
 """What the tracker knows of MoveNet's keypoints."""
 _TRUNK_HEIGHT_RATIO = 0.3
 """Length of the trunk as a share of the height."""

@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from bodyslam_jax.tracking.appearance import difference, mean_look
 
-GATE_HEIGHTS, _GATE_GROWTH_HEIGHTS_PER_S = 0.18, 0.6
+_GATE_HEIGHTS, _GATE_GROWTH_HEIGHTS_PER_S = 0.18, 0.6
 """Gate on the distance from the predicted position, relative to the person's size in
 the image, and its growth with the time since the last detection (`benchmarks/video.md`,
 which also has the figures of other gates)."""
@@ -50,6 +50,10 @@ class PointSet:
     mirrored: tuple[int, ...] | None = None
     """For each keypoint the one on the other side of the body, for which a detector may
     take it; `None` if there are no sides."""
+    remembered: bool = True
+    """Whether a hidden keypoint is moved along with the others, so that a half hidden
+    person keeps their size. Of MoveNet, which guesses all keypoints, tracks of people
+    who overlap are exchanged by it (`benchmarks/video.md`)."""
 
 
 @dataclasses.dataclass
@@ -73,8 +77,7 @@ class Tracklet:
         self.velocity = np.zeros(2)
         """Smoothed velocity of the keypoints in the last frame, px per frame."""
         self.whole = self.points[0]
-        """Keypoints in the last frame. Hidden ones are moved along with the others, so
-        that a half hidden person keeps their size."""
+        """Keypoints in the last frame, with hidden ones that are remembered."""
         self.hidden = np.zeros(len(self.whole))
         """Frames since each keypoint was last detected."""
 
@@ -104,7 +107,7 @@ class Tracklet:
             share = 1 - np.exp(-gap / (_VELOCITY_SMOOTHING_S * self.fps))
             self.velocity = (1 - share) * self.velocity + share * moved / gap
         self.hidden = np.where(sure, 0, self.hidden + gap)
-        kept = ~sure & known & (self.hidden <= self.max_gap)
+        kept = ~sure & known & (self.hidden <= self.max_gap) & self.kind.remembered
         before, self.whole = self.whole, points.copy()
         self.whole[kept] = before[kept]
         self.whole[kept, :2] += moved
@@ -223,7 +226,7 @@ class Tracker:
         if mirrored is not None:
             exchanged = displacement(expected, points[:, list(mirrored)], least)
             place = np.minimum(place, exchanged)
-        gate = GATE_HEIGHTS + _GATE_GROWTH_HEIGHTS_PER_S * gaps / self.fps
+        gate = _GATE_HEIGHTS + _GATE_GROWTH_HEIGHTS_PER_S * gaps / self.fps
         place = place / gate[:, None]
         growth = _growth(expected, points, least)
         look = 1 - _overlap(expected, points, least)
