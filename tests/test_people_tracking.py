@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-from bodyslam_jax.people.appearance import describe, difference, mean_look
+from bodyslam_jax.body.skeleton import COCO17_MIRRORED
 from bodyslam_jax.people.linking import link, remarks
+from bodyslam_jax.people.movenet import MOVENET_POINTS
 from bodyslam_jax.people.phantoms import is_phantom
 from bodyslam_jax.people.regions import behind, regions
-from bodyslam_jax.people.tracking import Tracker, Tracklet, between
+from bodyslam_jax.tracking.appearance import describe, difference, mean_look
+from bodyslam_jax.tracking.tracker import PointSet, Tracker, Tracklet, between
 
 # COCO's 17 keypoints of somebody who stands, in units of the height.
 STANDING = np.array(
@@ -31,7 +33,7 @@ def clothes(share):
 
 def follow(frames, fps=30.0, max_gap=0.7):
     """People found in `frames`, lists of (truth, points, look), and remarks on them."""
-    tracker, truth = Tracker(fps, max_gap), {}
+    tracker, truth = Tracker(fps, max_gap, MOVENET_POINTS), {}
     for k, found in enumerate(frames):
         points = np.array([p for _, p, _ in found]).reshape(-1, 17, 3)
         looks = np.array([look for *_, look in found]).reshape(len(found), 192)
@@ -39,7 +41,7 @@ def follow(frames, fps=30.0, max_gap=0.7):
         who = tracker.update(k, points, looks, sure, sure)
         for (name, *_), number in zip(found, who.tolist(), strict=True):
             truth[number, k] = name
-    people = link(tracker.tracklets, fps)
+    people = link(tracker.tracklets)
     named = [
         [(k, truth[t.number, k]) for t in pieces for k in t.frames] for pieces in people
     ]
@@ -158,8 +160,44 @@ def test_a_jump_is_somebody_else_and_is_said(change):
     assert "taken for somebody else" in said[0]
 
 
+def test_who_stays_in_place_is_not_moved_on_so_that_everybody_has_a_detection():
+    """Of two side by side one goes, and somebody comes on the other side of the other:
+    all detections could continue a track, each of a neighbour."""
+    tracker = Tracker(30.0, 0.7, MOVENET_POINTS)
+    for k in range(20):
+        tracker.update(k, np.stack([standing(100), standing(132)]))
+    assert tracker.update(20, np.stack([standing(132), standing(165)])).tolist() == [
+        1,
+        2,
+    ]
+
+
+@pytest.mark.parametrize("fps", [10.0, 30.0])
+def test_sides_that_a_detector_exchanges_are_of_the_same_person(fps):
+    """Two walk past each other; of one, left and right are exchanged now and then."""
+    tracker = Tracker(fps, 0.7, MOVENET_POINTS)
+    for k in range(round(3 * fps)):
+        points = np.stack([standing(100 + 90 * k / fps), standing(400 - 90 * k / fps)])
+        if k % 4 == 3:
+            points[0] = points[0, list(COCO17_MIRRORED)]
+        assert sorted(tracker.update(k, points).tolist()) == [0, 1]
+    assert np.ptp([p[:, 0].mean() for p in tracker.tracklets[0].points]) > 200
+
+
+def test_a_half_hidden_person_keeps_size_and_place():
+    """Only the feet are seen for a while, and then the head."""
+    tracker = Tracker(30.0, 0.7, PointSet(0.15))
+    for k in range(30):
+        points = standing(100 + 3 * k)
+        if 10 <= k < 20:
+            points[slice(0, 13) if k < 15 else slice(5, 17), 2] = 0.0
+        assert tracker.update(k, points[None]).tolist() == [0]
+    whole = tracker.tracklets[0].expected(30)
+    np.testing.assert_allclose(whole[:, :2], standing(190)[:, :2], atol=1.0)
+
+
 def test_a_gap_is_filled_on_a_line():
-    tracker = Tracker(30.0, 0.7)
+    tracker = Tracker(30.0, 0.7, MOVENET_POINTS)
     yes = np.ones(1, bool)
     for k in (0, 1, 5):
         tracker.update(k, standing(100 + 2.0 * k)[None], clothes(0.3)[None], yes, yes)
@@ -205,7 +243,10 @@ def test_colours_tell_people_apart_and_light_hardly_does():
 
 def tracklet(number, frames, detections, colour=0.3):
     looks = [clothes(colour) for _ in frames]
-    return Tracklet(number, list(frames), list(detections), looks)
+    return Tracklet(
+        *(number, list(frames), list(detections), looks),
+        *(MOVENET_POINTS, 30.0, 21.0),
+    )
 
 
 def test_a_part_of_a_person_found_whole_is_nobody_elses_return():
@@ -217,11 +258,11 @@ def test_a_part_of_a_person_found_whole_is_nobody_elses_return():
     legs[:11] = legs[11:13].mean(axis=0)
     first = tracklet(0, [*range(25), 39], [*before, legs])
     second = tracklet(1, range(38, 78), after)
-    people = link([first, second], 30.0)
+    people = link([first, second])
     assert [[len(t.frames) for t in pieces] for pieces in people] == [[25, 40]]
     # A return as sure as anybody stays.
     first.points[-1] = standing(900)
-    assert len(link([first, second], 30.0)) == 2
+    assert len(link([first, second])) == 2
 
 
 def faint(x, k, legs=0.05, face=0.2, trunk=0.4):

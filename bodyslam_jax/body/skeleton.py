@@ -152,6 +152,11 @@ BODY25_MIRRORED: tuple[int, ...] = tuple(
     BODY25[_other_side(name)] for name in KEYPOINT_NAMES["body25"]
 )
 """For each keypoint of BODY_25, the one on the other side of the body."""
+COCO17_MIRRORED: tuple[int, ...] = tuple(
+    KEYPOINT_NAMES["coco17"].index(_other_side(name))
+    for name in KEYPOINT_NAMES["coco17"]
+)
+"""For each of COCO's keypoints, the one on the other side of the body."""
 BODY25_FACE = (BODY25["nose"], BODY25["right_eye"], BODY25["left_eye"])
 BODY25_ANKLES = (BODY25["right_ankle"], BODY25["left_ankle"])
 BODY25_TOES_AND_HEELS = (

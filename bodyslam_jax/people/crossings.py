@@ -7,11 +7,13 @@ tracklets are cut there. The pieces are assigned to people afterwards, all toget
 (`linking`), which also rejoins a piece that nobody else explains.
 """
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax.people.appearance import difference, mean_look
-from bodyslam_jax.people.tracking import Tracklet
+from bodyslam_jax.tracking.appearance import difference, mean_look
+from bodyslam_jax.tracking.tracker import Tracklet
 
 _WINDOW_S = 0.33
 """Time before and after a change over which colours are averaged. Slow changes, such as
@@ -30,7 +32,7 @@ _MAX_OWN_SIDE_RATIO = 0.5
 side up to which the frame belongs to its side."""
 
 
-def cut(tracklet: Tracklet, fps: float) -> list[Tracklet]:
+def cut(tracklet: Tracklet) -> list[Tracklet]:
     """Returns the pieces of a tracklet between abrupt changes of clothes; the tracklet
     itself if there is none.
 
@@ -41,20 +43,20 @@ def cut(tracklet: Tracklet, fps: float) -> list[Tracklet]:
     if len(known) < 2 * _MIN_DESCRIPTORS:
         return [tracklet]
     looks = np.stack([tracklet.looks[k] for k in known])
-    window = max(_MIN_DESCRIPTORS, round(_WINDOW_S * fps))
+    window = max(_MIN_DESCRIPTORS, round(_WINDOW_S * tracklet.fps))
     stretches = _stretches(looks, 0, len(known), window)
     starts = [0, *(known[first] for first, _ in stretches[1:])]
     stops = [*(known[last - 1] + 1 for _, last in stretches[:-1]), len(tracklet.frames)]
-    return [part(tracklet, i, j, fps) for i, j in zip(starts, stops, strict=True)]
+    return [part(tracklet, i, j) for i, j in zip(starts, stops, strict=True)]
 
 
-def part(tracklet: Tracklet, start: int, stop: int, fps: float) -> Tracklet:
+def part(tracklet: Tracklet, start: int, stop: int) -> Tracklet:
     """Returns the detections with indices `start` to `stop` (exclusive), with the
     velocity at their end."""
-    return chosen(tracklet, list(range(start, stop)), fps)
+    return chosen(tracklet, list(range(start, stop)))
 
 
-def chosen(tracklet: Tracklet, indices: list[int], fps: float) -> Tracklet:
+def chosen(tracklet: Tracklet, indices: list[int]) -> Tracklet:
     """Returns the detections with these indices, in order of time."""
     if len(indices) == len(tracklet.frames):
         return tracklet
@@ -62,9 +64,9 @@ def chosen(tracklet: Tracklet, indices: list[int], fps: float) -> Tracklet:
         (tracklet.frames[i], tracklet.points[i], tracklet.looks[i]) for i in indices
     )
     frame, points, look = next(rows)
-    piece = Tracklet(tracklet.number, [frame], [points], [look])
+    piece = dataclasses.replace(tracklet, frames=[frame], points=[points], looks=[look])
     for row in rows:
-        piece.extend(*row, fps)
+        piece.extend(*row)
     return piece
 
 

@@ -15,9 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from bodyslam_jax.config import Association, Detect
-from bodyslam_jax.io.keypoints.associate import doubles, is_stray
 from bodyslam_jax.people import blazepose, movenet
-from bodyslam_jax.people.appearance import DESCRIPTOR_SIZE, describe
 from bodyslam_jax.people.found import (
     MAX_DISAGREEMENT,
     Found,
@@ -25,12 +23,20 @@ from bodyslam_jax.people.found import (
     find_feet,
 )
 from bodyslam_jax.people.linking import link, remarks
-from bodyslam_jax.people.movenet import MIN_SURE_SCORE, Region, sure_points
+from bodyslam_jax.people.movenet import (
+    MIN_SURE_SCORE,
+    MOVENET_POINTS,
+    Region,
+    height,
+    sure_points,
+)
 from bodyslam_jax.people.networks import BLAZEPOSE, MOVENET, open_network
 from bodyslam_jax.people.phantoms import MIN_CONFIRMED_HEIGHT_PX, is_phantom
 from bodyslam_jax.people.regions import behind, covered, regions, square_around
-from bodyslam_jax.people.tracking import Tracker, Tracklet, between, height
 from bodyslam_jax.sfm import SILHOUETTE_STEP
+from bodyslam_jax.tracking.appearance import DESCRIPTOR_SIZE, describe
+from bodyslam_jax.tracking.duplicates import doubles, is_stray
+from bodyslam_jax.tracking.tracker import Tracker, Tracklet, between
 
 SEARCH_INTERVAL_S = 0.33
 """Time between two searches of the whole image."""
@@ -107,7 +113,7 @@ class _Finder:
         self.blazepose = open_network(BLAZEPOSE)
         self.fps, self.settings, self.association = fps, settings, association
         self.whom = settings.min_height, _MAX_PEOPLE
-        self.tracker = Tracker(fps, association.max_gap)
+        self.tracker = Tracker(fps, association.max_gap, MOVENET_POINTS)
         self.interval = max(1, round(SEARCH_INTERVAL_S * fps))
         self.next_search, self.last_search, self.searches = (
             0,
@@ -124,7 +130,7 @@ class _Finder:
         """Processes image `k` (BGR): detects people and assigns them to tracklets."""
         size = tuple(-(-n // SILHOUETTE_STEP) for n in image.shape[:2])
         now = _Frame(image, np.zeros(size, bool), {}, [])
-        expected = [t.expected(k, self.fps) for t in self.tracker.alive(k)]
+        expected = [t.expected(k) for t in self.tracker.alive(k)]
         found = [
             self._look(image, r, SQUARE_INPUT_PX) for r in regions(expected, *self.whom)
         ]
@@ -155,7 +161,7 @@ class _Finder:
     def result(self) -> Found:
         """Returns all detections after the last image, with tracklets linked to
         people."""
-        everybody = link(self.tracker.tracklets, self.fps)
+        everybody = link(self.tracker.tracklets)
         phantoms = [p for p in everybody if self._is_phantom(p)]
         real = [p for p in everybody if not any(p is q for q in phantoms)]
         people = sorted(filter(self._is_estimated, real), key=_presence, reverse=True)
@@ -277,13 +283,12 @@ class _Finder:
             near = self._look(frame.image, square_around(first), SQUARE_INPUT_PX)
             points, score = merged([near])
             looks = self._looks(frame.image, points)
-            cost = [
-                self.tracker.cost_before(tracklet, p, look)
-                for p, look in zip(points, looks, strict=True)
-            ]
-            best = int(np.argmin(cost)) if cost else 0
+            if not len(points):
+                return
+            cost = self.tracker.cost_before(tracklet, points, looks)
+            best = int(np.argmin(cost))
             taken = frame.tracked.values()
-            if not cost or cost[best] >= 1 or score[best] < MIN_CONTINUE_SCORE:
+            if cost[best] >= 1 or score[best] < MIN_CONTINUE_SCORE:
                 return
             if any(movenet.same_person(points[best], p) for p in taken):
                 return

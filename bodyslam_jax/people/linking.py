@@ -10,23 +10,23 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from bodyslam_jax.people.appearance import difference, mean_look
 from bodyslam_jax.people.crossings import chosen, cut, part
+from bodyslam_jax.people.movenet import height
 from bodyslam_jax.people.regions import behind
-from bodyslam_jax.people.tracking import (
+from bodyslam_jax.tracking.appearance import difference, mean_look
+from bodyslam_jax.tracking.tracker import (
     LONG_GAP_FRAMES,
     MAX_SIZE_RATIO,
     Tracklet,
     displacement,
-    height,
 )
 
 _SHORT_GAP_S = 1.0
 """Gap up to which the position in the image is compared."""
-_GATE_HEIGHTS = 0.2
-"""Gate on the distance from the predicted position, relative to the person's height in
-the image."""
-_GATE_GROWTH_HEIGHTS_PER_S = 1.2
+_GATE_HEIGHTS, _GATE_GROWTH_HEIGHTS_PER_S = 0.3, 1.2
+"""Gate on the distance from the predicted position, relative to the person's height,
+and its growth with time. Both are twice the tracker's or nearly so, as colours must
+agree more closely (`benchmarks/video.md`)."""
 _MAX_COLOUR_DIFFERENCE = 14.0
 """Difference of colours up to which a person after a long gap is the same."""
 _MAX_NEARBY_COLOUR_DIFFERENCE = 22.0
@@ -40,17 +40,17 @@ _END_FRAMES = 20
 """Number of frames at the end of a piece over which its size is averaged."""
 
 
-def link(tracklets: list[Tracklet], fps: float) -> list[list[Tracklet]]:
+def link(tracklets: list[Tracklet]) -> list[list[Tracklet]]:
     """Returns the people, each as a list of pieces in order of time.
 
     Successive pieces of one tracklet that belong to the same person are merged into the
     original tracklet, or its part from the first piece to the last.
     """
-    tracklets = without_fragments(tracklets, fps)
-    pieces = [piece for t in tracklets for piece in cut(t, fps)]
+    tracklets = without_fragments(tracklets)
+    pieces = [piece for t in tracklets for piece in cut(t)]
     if not pieces:
         return []
-    gain = np.array([[join_cost(a, b, fps) for b in pieces] for a in pieces]) - 1
+    gain = np.array([[join_cost(a, b) for b in pieces] for a in pieces]) - 1
     goes_on = {i for i, (a, b) in enumerate(pairwise(pieces)) if a.number == b.number}
     for i in goes_on:
         gain[i, i + 1] = _cost_to_go_on(pieces[i], pieces[i + 1]) - 1
@@ -67,7 +67,7 @@ def link(tracklets: list[Tracklet], fps: float) -> list[list[Tracklet]]:
                 all_of_it = whole[pieces[i].number]
                 start = all_of_it.frames.index(person[-1].frames[0])
                 stop = all_of_it.frames.index(pieces[j].frames[-1]) + 1
-                person[-1] = part(all_of_it, start, stop, fps)
+                person[-1] = part(all_of_it, start, stop)
             else:
                 person.append(pieces[j])
             i = j
@@ -75,7 +75,7 @@ def link(tracklets: list[Tracklet], fps: float) -> list[list[Tracklet]]:
     return people
 
 
-def without_fragments(tracklets: list[Tracklet], fps: float) -> list[Tracklet]:
+def without_fragments(tracklets: list[Tracklet]) -> list[Tracklet]:
     """Returns the tracklets without detections that only a part of another person
     explains.
 
@@ -88,11 +88,11 @@ def without_fragments(tracklets: list[Tracklet], fps: float) -> list[Tracklet]:
     for t in tracklets:
         for frame, points in zip(t.frames, t.points, strict=True):
             at.setdefault(frame, []).append((t.number, points))
-    return [_without_fragments(t, at, fps) for t in tracklets]
+    return [_without_fragments(t, at) for t in tracklets]
 
 
 def _without_fragments(
-    tracklet: Tracklet, at: dict[int, list[tuple[int, np.ndarray]]], fps: float
+    tracklet: Tracklet, at: dict[int, list[tuple[int, np.ndarray]]]
 ) -> Tracklet:
     kept = list(range(len(tracklet.frames)))
     ends = [
@@ -115,7 +115,7 @@ def _without_fragments(
             if not _is_part(tracklet.points[j], others):
                 break
             kept.remove(j)
-    return chosen(tracklet, kept, fps)
+    return chosen(tracklet, kept)
 
 
 def _is_part(points: np.ndarray, others: list[np.ndarray]) -> bool:
@@ -145,7 +145,7 @@ def remarks(people: list[list[Tracklet]], fps: float, max_gap: float) -> list[st
             if other == number or not 0 < gap <= max_gap:
                 continue
             frame = first.frames[0]
-            away = displacement(others[-1].expected(frame, fps), first.points[0])
+            away = _apart(others[-1], first)
             if away > _MAX_JUMP_HEIGHTS:
                 continue
             where = f"{away:.1f} of their height away"
@@ -156,7 +156,7 @@ def remarks(people: list[list[Tracklet]], fps: float, max_gap: float) -> list[st
     return found
 
 
-def join_cost(a: Tracklet, b: Tracklet, fps: float) -> float:
+def join_cost(a: Tracklet, b: Tracklet) -> float:
     """Returns the cost of joining two pieces: 0 where `b` certainly continues `a`, 1
     and more where it does not."""
     gap = b.frames[0] - a.frames[-1]
@@ -164,15 +164,14 @@ def join_cost(a: Tracklet, b: Tracklet, fps: float) -> float:
         return np.inf
     looks = difference(mean_look(np.stack(a.looks)), mean_look(np.stack(b.looks)))
     growth = abs(np.log(_size(a, last=True) / _size(b, last=False)))
-    seconds = gap / fps
+    seconds = gap / a.fps
     growth /= np.log(
         _MAX_LONG_GAP_SIZE_RATIO if seconds > _SHORT_GAP_S else MAX_SIZE_RATIO
     )
     if seconds > _SHORT_GAP_S:
         clothes = looks / _MAX_COLOUR_DIFFERENCE if np.isfinite(looks) else np.inf
         return float(max(clothes, growth)) if max(clothes, growth) < 1 else np.inf
-    place = displacement(a.expected(b.frames[0], fps), b.points[0])
-    place /= _GATE_HEIGHTS + _GATE_GROWTH_HEIGHTS_PER_S * seconds
+    place = _apart(a, b) / (_GATE_HEIGHTS + _GATE_GROWTH_HEIGHTS_PER_S * seconds)
     clothes = looks / _MAX_NEARBY_COLOUR_DIFFERENCE if np.isfinite(looks) else 0.5
     worst = max(place, clothes, growth)
     return float(0.5 * place + 0.5 * clothes) if worst < 1 else np.inf
@@ -184,6 +183,13 @@ def _cost_to_go_on(a: Tracklet, b: Tracklet) -> float:
     also changes colours."""
     looks = difference(mean_look(np.stack(a.looks)), mean_look(np.stack(b.looks)))
     return 0.5 * looks / _MAX_NEARBY_COLOUR_DIFFERENCE
+
+
+def _apart(a: Tracklet, b: Tracklet) -> float:
+    """Returns the distance of the first keypoints of `b` from those that `a` predicts,
+    relative to the person's size."""
+    first, least = b.points[0], a.kind.min_confidence
+    return float(displacement(a.expected(b.frames[0])[None], first[None], least)[0, 0])
 
 
 def _size(tracklet: Tracklet, *, last: bool) -> float:

@@ -14,7 +14,6 @@ from jaxtyping import Float, UInt8
 from bodyslam_jax.config import Association, Detect
 from bodyslam_jax.io.keypoints.layouts import LAYOUTS
 from bodyslam_jax.people import movenet
-from bodyslam_jax.people.appearance import DESCRIPTOR_SIZE, describe, difference
 from bodyslam_jax.people.find import (
     COARSE_INPUT_PX,
     MIN_CONTINUE_SCORE,
@@ -26,10 +25,16 @@ from bodyslam_jax.people.find import (
     merged,
 )
 from bodyslam_jax.people.found import as_body25
-from bodyslam_jax.people.movenet import MIN_SURE_SCORE, sure_points
+from bodyslam_jax.people.movenet import (
+    MIN_SURE_SCORE,
+    MOVENET_POINTS,
+    height,
+    sure_points,
+)
 from bodyslam_jax.people.networks import BLAZEPOSE, MOVENET, open_network
 from bodyslam_jax.people.regions import behind, regions
-from bodyslam_jax.people.tracking import MAX_COLOUR_DIFFERENCE, Tracker, height
+from bodyslam_jax.tracking.appearance import DESCRIPTOR_SIZE, describe, difference
+from bodyslam_jax.tracking.tracker import MAX_COLOUR_DIFFERENCE, Tracker
 
 _SEARCH_INTERVAL_TRACKED_S = 1.0
 """Time between two searches of the whole image while somebody is tracked, s."""
@@ -64,7 +69,7 @@ class LivePeople:
         association: Association = Association(),
     ) -> None:
         self.fps, self.settings = fps, settings
-        self.tracker = Tracker(fps, association.max_gap)
+        self.tracker = Tracker(fps, association.max_gap, MOVENET_POINTS)
         self.persons: dict[int, _Person] = {}
         self.frame, self.next_search = 0, 0
         self.networks: tuple | None = None
@@ -85,7 +90,7 @@ class LivePeople:
         self.load_networks()
         assert self.networks is not None
         alive = self.tracker.alive(self.frame)
-        expected = [t.expected(self.frame, self.fps) for t in alive]
+        expected = [t.expected(self.frame) for t in alive]
         squares = regions(expected, self.settings.min_height, _MAX_PEOPLE)
         found = [self._look(image, r, SQUARE_INPUT_PX) for r in squares]
         if self.frame >= self.next_search:

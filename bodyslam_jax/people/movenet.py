@@ -12,6 +12,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from bodyslam_jax.body.skeleton import COCO17_MIRRORED
+from bodyslam_jax.tracking.tracker import PointSet
+
 NUM_KEYPOINTS = 17
 """Number of COCO keypoints, in COCO's order: nose, eyes, ears, shoulders, elbows,
 wrists, hips, knees, ankles, left before right."""
@@ -141,6 +144,12 @@ MIN_SURE_SCORE = 0.15
 person's height (`found.confidence`)."""
 
 
+MOVENET_POINTS = PointSet(MIN_SURE_SCORE, COCO17_MIRRORED, remembered=False)
+"""What the tracker knows of MoveNet's keypoints."""
+_TRUNK_HEIGHT_RATIO = 0.3
+"""Length of the trunk as a share of the height."""
+
+
 def box(points: Float[np.ndarray, "17 3"]) -> Float[np.ndarray, " 4"]:
     """Returns left, top, right, bottom (px) of a person's keypoints with a score above
     `MIN_SURE_SCORE`, or of all keypoints if fewer than two have such a score."""
@@ -153,3 +162,12 @@ def box_size(points: Float[np.ndarray, "17 3"]) -> float:
     """Returns the longer side of a person's `box`, px."""
     left, top, right, bottom = box(points)
     return float(max(right - left, bottom - top))
+
+
+def height(points: Float[np.ndarray, "17 3"]) -> float:
+    """Returns the size of a person in the image (px), also if bent or partly hidden."""
+    size = max(box_size(points), 1.0)
+    if sure_points(points)[[5, 6, 11, 12]].all():
+        trunk = points[[5, 6], :2].mean(0) - points[[11, 12], :2].mean(0)
+        size = max(size, float(np.linalg.norm(trunk)) / _TRUNK_HEIGHT_RATIO)
+    return size

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from scipy.ndimage import uniform_filter1d
 
 from bodyslam_jax.people.blazepose import turned_square
-from bodyslam_jax.people.movenet import MIN_SURE_SCORE
-from bodyslam_jax.people.tracking import Tracklet, height
+from bodyslam_jax.people.movenet import MIN_SURE_SCORE, height
+from bodyslam_jax.tracking.tracker import Tracklet
 
 MIN_CONFIRMED_HEIGHT_PX = 60.0
 """Height of people below which BlazePose is not used."""

@@ -5,8 +5,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.people import movenet
-from bodyslam_jax.people.movenet import Region
-from bodyslam_jax.people.tracking import height
+from bodyslam_jax.people.movenet import Region, height
 
 _SQUARE_FACTOR = 1.35
 """Side of the search square, relative to the height of the expected person."""

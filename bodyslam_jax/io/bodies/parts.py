@@ -26,7 +26,7 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.budget import MAX_PEOPLE
 from bodyslam_jax.io.declared import as_array
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
-from bodyslam_jax.io.keypoints.associate import identify
+from bodyslam_jax.tracking.tracker import PointSet, identify
 from bodyslam_jax.types import Intrinsics
 
 PELVIS_SMPL = np.array([-0.0018, -0.2233, 0.0282])
@@ -40,6 +40,7 @@ _BODY_GRID_M = np.stack(
     np.meshgrid(np.linspace(-0.25, 0.25, 5), np.linspace(-0.85, 0.85, 5))
 )
 """Grid of the size of a body around its middle, in the plane of the image, m."""
+_GRID_POINTS = PointSet(min_confidence=0.0)
 _log = logging.getLogger(__name__)
 _MIN_SIZE_PX = 1e-9
 """Least size, px, which avoids a division by 0; far below that of any person."""
@@ -135,10 +136,14 @@ class Video:
     config: Association = Association()
     warn: Warn = _log.warning
 
+    @property
+    def rate(self) -> float:
+        """Frame rate, 1/s; 30 if it is not known."""
+        return self.fps or 30.0
+
     def frames_in(self, seconds: float) -> int:
-        """Returns the number of frames in so many seconds, at least 1; at 30/s if the
-        video's rate is not known."""
-        return max(1, round(seconds * (self.fps or 30.0)))
+        """Returns the number of frames in so many seconds, at least 1."""
+        return max(1, round(seconds * self.rate))
 
 
 def frames_of_images(names: list[str], video: Video, *, complete: bool) -> np.ndarray:
@@ -172,7 +177,9 @@ def tell_apart(frame: np.ndarray, trans: np.ndarray, video: Video) -> np.ndarray
     points = np.stack([u, v, np.ones_like(u)], axis=-1)
     points[~np.isfinite(points).all(axis=-1)] = 0.0
     first = np.searchsorted(frame[order], np.arange(1, frame.max(initial=0) + 1))
-    found = identify(np.split(points, first), video.frames_in(video.config.max_gap))
+    found = identify(
+        np.split(points, first), video.rate, video.config.max_gap, _GRID_POINTS
+    )
     person = np.empty(len(frame), dtype=np.int64)
     person[order] = np.concatenate(found)
     return person
