@@ -180,6 +180,7 @@ def test_a_network_that_is_missing_or_damaged_is_one_line(harm, tmp_path, monkey
     assert [name for name, _ in people.network_status()] == [
         "movenet_multipose.onnx",
         "blazepose_full.onnx",
+        "blazepose_heavy.onnx",
     ]
 
 
@@ -244,6 +245,32 @@ def test_blazeposes_square_is_upright_and_its_points_come_back(angle):
     away = blazepose.disagreement(pose, points)
     np.testing.assert_allclose(away[sure], 0, atol=1e-4)
     np.testing.assert_allclose(pose.world[11, :2], 0.5 * square.up, atol=1e-6)
+
+
+def test_a_doubtful_wrist_that_blazepose_sees_is_blazeposes():
+    points = np.column_stack([np.zeros((17, 2)), np.full(17, 0.9)])
+    points[[9, 10], 2] = 0.3  # a confidence of 0.5
+    square = blazepose.Square(np.zeros(2), 250.0, np.array([0.0, -1.0]))
+    landmarks = np.ones((33, 3))
+    landmarks[[15, 16], 2] = 0.9, 0.2  # the right wrist is a guess
+    mask, world = np.zeros((256, 256), np.uint8), np.zeros((33, 3))
+    pose = blazepose.Pose(landmarks, 1.0, mask, square, world)
+    body = found_.as_body25(points, None, found_.find_wrists(pose, points))
+    np.testing.assert_allclose(body[7], [1, 1, found_.SURE_WRIST])
+    np.testing.assert_allclose(body[4], [0, 0, 0.5**3])
+    points[9, 2] = 0.9
+    body = found_.as_body25(points, None, found_.find_wrists(pose, points))
+    np.testing.assert_allclose(body[7], [0, 0, 1])
+
+
+def test_the_best_networks_change_doubtful_wrists_alone(scene, found):
+    best = people.find_people_tracked(scene[1], 30.0, Detect(networks="best"))
+    changed = (best.points != found.points).any(axis=-1)
+    assert changed[:, [4, 7]].any()
+    assert not np.delete(changed, [4, 7], axis=1).any()
+    np.testing.assert_allclose(best.points[changed][:, 2], found_.SURE_WRIST)
+    doubtful = found.points[changed][:, 2] ** (1 / 3)
+    assert (doubtful < found_.SURE_WRIST).all()
 
 
 def test_feet_of_somebody_else_are_left_out():

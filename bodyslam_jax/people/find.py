@@ -20,7 +20,9 @@ from bodyslam_jax.people.found import (
     MAX_DISAGREEMENT,
     Found,
     as_body25,
+    doubtful_wrists,
     find_feet,
+    find_wrists,
 )
 from bodyslam_jax.people.linking import link, remarks
 from bodyslam_jax.people.movenet import (
@@ -30,7 +32,12 @@ from bodyslam_jax.people.movenet import (
     height,
     sure_points,
 )
-from bodyslam_jax.people.networks import BLAZEPOSE, MOVENET, open_network
+from bodyslam_jax.people.networks import (
+    BLAZEPOSE,
+    BLAZEPOSE_HEAVY,
+    MOVENET,
+    open_network,
+)
 from bodyslam_jax.people.phantoms import MIN_CONFIRMED_HEIGHT_PX, is_phantom
 from bodyslam_jax.people.regions import behind, covered, regions, square_around
 from bodyslam_jax.sfm import SILHOUETTE_STEP
@@ -111,6 +118,8 @@ class _Finder:
     def __init__(self, fps: float, settings: Detect, association: Association) -> None:
         self.movenet = open_network(MOVENET)
         self.blazepose = open_network(BLAZEPOSE)
+        best = settings.networks == "best"
+        self.heavy = open_network(BLAZEPOSE_HEAVY) if best else None
         self.fps, self.settings, self.association = fps, settings, association
         self.whom = settings.min_height, _MAX_PEOPLE
         self.tracker = Tracker(fps, association.max_gap, MOVENET_POINTS)
@@ -123,6 +132,8 @@ class _Finder:
         self.recent: deque[tuple[int, _Frame]] = deque(maxlen=self.interval + 1)
         self.feet: dict[tuple[int, int], np.ndarray] = {}
         """Heel and big toe of both sides (4, 3), by tracklet and frame."""
+        self.wrists: dict[tuple[int, int], np.ndarray] = {}
+        """What `find_wrists` returns, by tracklet and frame."""
         self.others: list[tuple[int, np.ndarray]] = []
         self.masks: list[np.ndarray] = []
 
@@ -184,7 +195,7 @@ class _Finder:
         for tracklet in self.tracker.tracklets:
             for frame, points in zip(tracklet.frames, tracklet.points, strict=True):
                 key = tracklet.number, frame
-                body = as_body25(points, self.feet.get(key))
+                body = as_body25(points, self.feet.get(key), self.wrists.get(key))
                 rows.append((frame, who.get(key, -1), body))
             rows += [alone(*other) for other in between(tracklet)]
         rows.sort(key=lambda row: row[:2])
@@ -268,6 +279,10 @@ class _Finder:
         frame.tracked[number] = points
         if height(points) < MIN_CONFIRMED_HEIGHT_PX:
             return
+        if self.heavy is not None and doubtful_wrists(points).any():
+            again = confirmed(self.heavy, frame.image, points)
+            if again is not None:
+                self.wrists[number, k] = find_wrists(again[0], points)
         found = confirmed(self.blazepose, frame.image, points)
         if found is None:
             return

@@ -4,7 +4,7 @@ confidences."""
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from bodyslam_jax.people import blazepose
 from bodyslam_jax.people.detect import to_body25
@@ -23,6 +23,14 @@ _FOOT_KEYPOINTS = ((21, 19, 11, 15), (24, 22, 14, 16))
 """BODY_25's heel, big toe and ankle, and COCO's ankle, of both sides."""
 _WRISTS = [9, 10]
 """COCO's wrists."""
+_WRIST_KEYPOINTS = (7, 4)
+"""BODY_25's wrists, left and right."""
+SURE_WRIST = 0.8
+"""Confidence below which MoveNet's wrist is looked for again, and that of a wrist found
+so. It errs by 24 to 40 mm in the median, where most of MoveNet's err by 83 to 176
+(`benchmarks/keypoints.md`)."""
+_MIN_VISIBILITY = 0.5
+"""Visibility from which BlazePose's wrist is seen; below it is a guess (112 mm)."""
 _WRIST_POWER = 3
 """Exponent of a wrist's confidence. The network guesses a wrist behind the trunk, often
 at the position of the other wrist: on ten rendered sequences the error was 2.5 times
@@ -76,10 +84,29 @@ def find_feet(
     return feet
 
 
+def doubtful_wrists(points: Float[np.ndarray, "17 3"]) -> Bool[np.ndarray, " 2"]:
+    """Returns which wrists, left and right, MoveNet is not sure of."""
+    return confidence(points[_WRISTS, 2]) < SURE_WRIST
+
+
+def find_wrists(
+    pose: blazepose.Pose, points: Float[np.ndarray, "17 3"]
+) -> Float[np.ndarray, "2 3"]:
+    """Returns the left and right wrist (u px, v px, confidence) that BlazePose sees and
+    MoveNet is not sure of; confidence 0 where that is not so."""
+    wrists = pose.landmarks[blazepose.COCO_OF_LANDMARKS[_WRISTS]].copy()
+    seen = wrists[:, 2] >= _MIN_VISIBILITY
+    wrists[:, 2] = np.where(seen & doubtful_wrists(points), SURE_WRIST, 0.0)
+    return wrists
+
+
 def as_body25(
-    points: Float[np.ndarray, "17 3"], feet: Float[np.ndarray, "4 3"] | None
+    points: Float[np.ndarray, "17 3"],
+    feet: Float[np.ndarray, "4 3"] | None,
+    wrists: Float[np.ndarray, "2 3"] | None = None,
 ) -> Float[np.ndarray, "25 3"]:
-    """Returns BODY_25 from MoveNet's keypoints and the output of `find_feet`."""
+    """Returns BODY_25 from MoveNet's keypoints and the output of `find_feet` and
+    `find_wrists`."""
     sure = confidence(points[:, 2])
     sure[_WRISTS] **= _WRIST_POWER
     found = to_body25(np.column_stack([points[:, :2], sure]))
@@ -87,6 +114,9 @@ def as_body25(
         for side, (heel, toe, _, _) in enumerate(_FOOT_KEYPOINTS):
             found[heel], found[toe] = feet[2 * side], feet[2 * side + 1]
         found[found[:, 2] <= 0] = 0.0
+    if wrists is not None:
+        for keypoint, wrist in zip(_WRIST_KEYPOINTS, wrists, strict=True):
+            found[keypoint] = wrist if wrist[2] > 0 else found[keypoint]
     return found
 
 

@@ -1,8 +1,9 @@
-"""Opens the two networks of the package as sessions of onnxruntime.
+"""Opens the networks of the package as sessions of onnxruntime.
 
 MoveNet MultiPose finds people and their 17 COCO keypoints in an image; BlazePose GHUM
-adds heels, toes and a mask for one person at a time. `assets/networks/MODEL_CARD.md`
-states their origin and licence.
+adds heels, toes and a mask for one person at a time, and its heavy variant the wrists
+of which MoveNet is not sure. `assets/networks/MODEL_CARD.md` states their origin and
+licence.
 """
 
 import dataclasses
@@ -41,7 +42,11 @@ BLAZEPOSE = Network(
     "blazepose_full.onnx",
     "1f23f73d0cd62553051863e68309dd0c566fa20d43ae2821236c371d1fadf829",
 )
-NETWORKS = (MOVENET, BLAZEPOSE)
+BLAZEPOSE_HEAVY = Network(
+    "blazepose_heavy.onnx",
+    "f825d769b6c5b8be97f0c85c47fd7ffcff8c807088bf77fb6d361aef2772cab2",
+)
+NETWORKS = (MOVENET, BLAZEPOSE, BLAZEPOSE_HEAVY)
 
 
 def open_network(network: Network) -> Any:
