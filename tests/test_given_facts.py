@@ -289,7 +289,7 @@ def test_gravity_is_compared_with_up_without_it(tilt):
     present = np.ones((2, 90), bool)
     _, up = level(
         T_WC,
-        T_WH,
+        T_WH[..., :3, 1],
         feet,
         present,
         np.zeros((0, 3)),

@@ -8,8 +8,12 @@ import pytest
 from test_measurability import FEET, FRAMES, LEGS, hidden, judged, scene
 
 from bodyslam_jax import motion
+from bodyslam_jax.body import load_body_model
 from bodyslam_jax.body.skeleton import ANKLES, KNEES, WRISTS
+from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics import seated
+from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.pipeline.run import assemble
 from bodyslam_jax.simulation.sequences import ASSETS
 
 ALL = np.ones(FRAMES, bool)
@@ -30,7 +34,9 @@ def who_keeps_still():
 
 
 def test_who_keeps_still_may_sit_and_a_walker_hardly():
-    walker, walking = judged(hidden(scene()[0], UNSEEN, np.arange(FRAMES)), *scene()[1:])
+    walker, walking = judged(
+        hidden(scene()[0], UNSEEN, np.arange(FRAMES)), *scene()[1:]
+    )
     sequence, *rest = who_keeps_still()
     other, still = judged(hidden(sequence, UNSEEN, np.arange(FRAMES)), *rest)
     (of_walker,), (of_other,) = (x["people"][0]["sitting"] for x in (walker, other))
@@ -103,3 +109,25 @@ def test_recorded_people_are_told_apart():
     assert (hips > 70).sum() > 50
     assert probability(sits)[hips > 70].mean() > 0.6
     assert max(probability(clip).mean() for clip in walks) < 0.25
+
+
+def test_the_pitch_of_a_pelvis_whose_thighs_are_hidden_is_not_up():
+    """The pelvis is pitched by 25 degrees under a trunk that stays as it was."""
+    sequence, cameras, joint = scene()
+    pitch = so3.exp(np.array([np.radians(25.0), 0.0, 0.0]))
+    roots, poses = joint.roots.copy(), joint.poses.copy()
+    roots[..., :3, :3] = roots[..., :3, :3] @ pitch
+    spine = pitch.T @ so3.exp(poses[:, :, 2])
+    poses[:, :, 2] = so3.log(spine)
+    leant = dataclasses.replace(joint, roots=roots, poses=poses)
+    unseen = hidden(sequence, UNSEEN, np.arange(FRAMES))
+
+    def off_vertical(sequence, estimate):
+        """Angle between up and the true up in the first camera, degrees."""
+        body = load_body_model()
+        result = assemble(sequence, Config(), body, cameras, estimate, {})
+        up = result.T_WC[0, :3, :3].T @ [0.0, 1.0, 0.0]
+        true = joint.cameras[0, :3, :3].T @ [0.0, 1.0, 0.0]
+        return np.degrees(np.arccos(up @ true))
+
+    assert off_vertical(unseen, leant) < 8.0 < 15.0 < off_vertical(sequence, leant)

@@ -79,7 +79,9 @@ def main() -> None:
     rows = [row for path in parser.parse_args().archives for row in frames(path)]
     subject, group, x = (np.array(column) for column in zip(*rows))
     sits, weight = group == "sits", weights(subject, group)
-    print("log odds at 1 m, and for each unit of its logarithm:", learn(x, sits, weight))
+    print(
+        "log odds at 1 m, and for each unit of its logarithm:", learn(x, sits, weight)
+    )
     p = np.zeros(len(x))
     for one in np.unique(subject):
         rest = subject != one

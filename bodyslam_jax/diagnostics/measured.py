@@ -2,9 +2,9 @@
 
 A keypoint is measured where it is visible in the image (`people.shown`). Hidden limbs
 and those outside the image are inferred: by priors of posture and motion, or by a
-regressor, whose bodies are complete in any case. About half of the squared error of a
-measured joint of arms and legs is along the view, and 0.35 of that of a hidden one
-(`benchmarks/plausibility.md`).
+regressor, whose bodies are complete in any case. Of the squared error of a measured
+knee or ankle somewhat more than half is along the view, of that of a hidden one 0.2 to
+0.45 (`benchmarks/plausibility.md`).
 """
 
 import dataclasses
@@ -45,7 +45,7 @@ error added in squares where it is hidden for long; the RMS error with a regress
 body. All are in m, from 28 rendered sequences, after alignment of the body
 (`benchmarks/video.md`). Bodies there were simulated without regard to occlusion, so the
 added error is that of bodies fitted to keypoints."""
-_OTHER_POSTURE_ERRORS_M = {"knee": 0.43, "ankle": 0.53, "foot": 0.52}
+_OTHER_POSTURE_ERRORS_M = {"knee": 0.43, "ankle": 0.49, "foot": 0.48}
 """Error added in squares where the person sits and the body stands, or the reverse, m:
 guessed legs of people on stools whose knees, ankles and feet are hidden, after
 alignment of the other joints (`benchmarks/plausibility.md`). A thigh of 0.38 m that is

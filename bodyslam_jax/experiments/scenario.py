@@ -175,7 +175,7 @@ def _upright(
     T_WC, joints = np.asarray(estimate.T_WC), np.asarray(estimate.joints)
     turn, _ = level(
         T_WC,
-        np.asarray(graph.world_from_root(state)),
+        np.asarray(graph.world_from_root(state))[..., :3, 1],
         joints[:, :, FEET],
         present,
         np.asarray(state.scale * state.landmarks),

@@ -121,7 +121,7 @@ def find_upright(
     is roughly up.
 
     Args:
-        trunks: y axes of the people's root frames, unit vectors.
+        trunks: directions in which people's trunks point, unit vectors.
         feet: toe joints, m.
         eyes: centres of the camera, m.
         landmarks: map points, m; empty if the camera did not move.
@@ -357,7 +357,7 @@ def _largest(covariance: Float[np.ndarray, "2 2"]) -> float:
 
 def level(
     T_WC: Float[np.ndarray, "t 4 4"],
-    T_WH: Float[np.ndarray, "h t 4 4"],
+    trunks: Float[np.ndarray, "h t 3"],
     feet: Float[np.ndarray, "h t 2 3"],
     present: Bool[np.ndarray, "h t"],
     landmarks: Float[np.ndarray, "l 3"],
@@ -377,7 +377,9 @@ def level(
     measured, up is estimated a second time without it, for comparison.
 
     Args:
-        T_WC, T_WH: poses of the camera and of people's roots, m.
+        T_WC: poses of the camera, m.
+        trunks: directions in which people's trunks point, unit vectors in the world:
+            the y axes of their root frames, or from pelvis to neck.
         feet: toe joints in the world, m.
         gravity: direction of gravity in the first camera's axes; empty if not measured.
         landmarks, fitted, standing, edges, on_floor: see `find_upright`.
@@ -386,12 +388,12 @@ def level(
     if gravity:
         up = -T_WC[0, :3, :3] @ np.asarray(gravity, float)
     elif present.any():
-        up = T_WH[present][:, :3, 1].sum(axis=0)
+        up = trunks[present].sum(axis=0)
     rough = upright(T_WC, up / np.linalg.norm(up))
     turn = rough[:3, :3]
     at = lambda points: points @ turn.T + rough[:3, 3]
     found = find_upright(
-        T_WH[..., :3, 1] @ turn.T,
+        trunks @ turn.T,
         at(feet),
         present,
         at(T_WC[:, :3, 3]),
@@ -409,7 +411,9 @@ def level(
     )
     if gravity:
         rest = (standing, edges, on_floor)
-        _, unaided = level(T_WC, T_WH, feet, present, landmarks, fps, fitted, (), *rest)
+        _, unaided = level(
+            T_WC, trunks, feet, present, landmarks, fps, fitted, (), *rest
+        )
         cosine = float(np.clip(unaided.up @ turn[1], -1, 1))
         found = dataclasses.replace(
             found,

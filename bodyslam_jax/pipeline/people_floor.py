@@ -171,7 +171,7 @@ def _upright(
     standing = toes_standing(None if probability is None else np.asarray(probability))
     return level(
         cameras,
-        roots,
+        roots[..., :3, 1],
         feet,
         view.present,
         np.zeros((0, 3)),
