@@ -74,7 +74,7 @@ def learn(x: np.ndarray, sits: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Learns who sits.")
     parser.add_argument("archives", type=Path, nargs="+")
     rows = [row for path in parser.parse_args().archives for row in frames(path)]
     subject, group, x = (np.array(column) for column in zip(*rows))
