@@ -166,7 +166,7 @@ def test_a_body_of_a_regressor_measures_no_hidden_legs():
     (person,) = summary["people"]
     assert person["status"] == "doubtful" and names(summary) == {"legs_inferred"}
     assert person["not_measured"] == {"arms": 0.0, "legs": 1.0}
-    assert (0.15 < sigma[..., ANKLES]).all() and (sigma[..., ANKLES] < 0.2).all()
+    assert (0.15 < sigma[..., ANKLES]).all() and (sigma[..., ANKLES] < 0.3).all()
     np.testing.assert_array_equal(sigma[..., WRISTS], sure[..., WRISTS])
     assert "regressor's bodies guess them" in str(summary["reasons"])
 

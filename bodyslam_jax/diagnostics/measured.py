@@ -2,7 +2,9 @@
 
 A keypoint is measured where it is visible in the image (`people.shown`). Hidden limbs
 and those outside the image are inferred: by priors of posture and motion, or by a
-regressor, whose bodies are complete in any case.
+regressor, whose bodies are complete in any case. Of the squared error of a measured
+knee or ankle somewhat more than half is along the view, of that of a hidden one 0.2 to
+0.45 (`benchmarks/plausibility.md`).
 """
 
 import dataclasses
@@ -13,8 +15,9 @@ from jaxtyping import Bool, Float
 from bodyslam_jax import people
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.body.skeleton import BODY25
+from bodyslam_jax.diagnostics import seated
 from bodyslam_jax.people.keypoint_errors import MIN_DETECTOR_SIGMA_PX
-from bodyslam_jax.types import JointEstimate, Sequence
+from bodyslam_jax.types import JointEstimate, Result, Sequence
 
 _SIDES = ("left", "right")
 _points = lambda *names: tuple(BODY25[f"{s}_{n}"] for n in names for s in _SIDES)
@@ -42,6 +45,11 @@ error added in squares where it is hidden for long; the RMS error with a regress
 body. All are in m, from 28 rendered sequences, after alignment of the body
 (`benchmarks/video.md`). Bodies there were simulated without regard to occlusion, so the
 added error is that of bodies fitted to keypoints."""
+_OTHER_POSTURE_ERRORS_M = {"knee": 0.43, "ankle": 0.49, "foot": 0.48}
+"""Error added in squares where the person sits and the body stands, or the reverse, m:
+guessed legs of people on stools whose knees, ankles and feet are hidden, after
+alignment of the other joints (`benchmarks/plausibility.md`). A thigh of 0.38 m that is
+level, not upright, is 0.54 m away at the knee and at all that hangs from it."""
 _JOINT_KEYPOINTS = {"foot": ("ankle", "big_toe", "heel"), "hand": ("wrist",)}
 """Keypoints any of which measures a joint, where their names differ from the
 joint's."""
@@ -64,7 +72,10 @@ class Measured:
     """Frames with a body of a regressor, or given by the user."""
     joint_sigma: Float[np.ndarray, "h t 24"]
     """Expected error (RMS distance) of each joint within the body, m; 0 where the
-    person is absent. It excludes errors of the body's position and size."""
+    person is absent. It excludes errors of the body's position and size; where legs are
+    not in view, those are the trunk's and the arms'."""
+    legs_unseen: Bool[np.ndarray, "h t"]
+    """Frames about which no knee and no ankle is visible (`seated.legs_unseen`)."""
 
     def shares(self, person: int, present: Bool[np.ndarray, " t"]) -> dict[str, float]:
         """Returns the share of a person's frames and keypoints, by limb, that were not
@@ -83,21 +94,27 @@ class Measured:
         return found
 
 
-def measured(sequence: Sequence, joint: JointEstimate, body: BodyModel) -> Measured:
+def measured(
+    sequence: Sequence, joint: JointEstimate, body: BodyModel, result: Result
+) -> Measured:
     """Returns which parts of the people of `joint` were measured, and the expected
-    errors of their joints."""
+    errors of their joints; `result` is the metric, upright version of `joint`."""
     h, t = joint.present.shape
     keypoint, given = np.zeros((h, t, 25), bool), np.zeros((h, t), bool)
     if h:
         keypoint = people.shown_keypoints(sequence, body)
     if sequence.bodies is not None:
         given = sequence.bodies.present & joint.present
-    sigma = np.zeros((h, t, 24))
+    sigma, unseen = np.zeros((h, t, 24)), np.zeros((h, t), bool)
     for k in range(h):
         pixels = pixels_per_metre(joint, k)
-        sigma[k] = joint_sigma(keypoint[k], given[k], pixels, sequence.fps)
+        unseen[k] = seated.legs_unseen(keypoint[k], joint.present[k], sequence.fps)
+        other = seated.other_posture_probability(
+            result.joints[k], unseen[k], sequence.fps
+        )
+        sigma[k] = joint_sigma(keypoint[k], given[k], pixels, sequence.fps, other)
     sigma = np.where(joint.present[..., None], sigma, 0.0)
-    return Measured(keypoint, given, sigma)
+    return Measured(keypoint, given, sigma, unseen)
 
 
 def joint_sigma(
@@ -105,6 +122,7 @@ def joint_sigma(
     given: Bool[np.ndarray, " t"],
     pixels: Float[np.ndarray, " t"],
     fps: float,
+    other_posture: Float[np.ndarray, " t"],
 ) -> Float[np.ndarray, "t 24"]:
     """Returns the expected error of a person's joints within the body, m.
 
@@ -127,7 +145,8 @@ def joint_sigma(
             here = np.asarray(keypoint[:, points].any(axis=1))
             grown = 1 - np.exp(-_time_to_nearest(here, fps) / _ERROR_GROWTH_TIME_S)
             known = np.where(given, with_body, usual * small)
-            sigma[:, joint] = np.sqrt(known**2 + hidden**2 * grown)
+            other = other_posture * _OTHER_POSTURE_ERRORS_M.get(name, 0.0) ** 2
+            sigma[:, joint] = np.sqrt(known**2 + hidden**2 * grown + other)
     return sigma
 
 

@@ -11,6 +11,7 @@ from bodyslam_jax.diagnostics.checks import Reason, judge
 from bodyslam_jax.diagnostics.gait import Gait
 from bodyslam_jax.diagnostics.measured import Measured
 from bodyslam_jax.diagnostics.plausibility import Doubts
+from bodyslam_jax.diagnostics.seated import Seated, stretches
 from bodyslam_jax.diagnostics.statistics import (
     PathStatistics,
     person_statistics,
@@ -46,6 +47,9 @@ class PersonVerdict:
     limb."""
     inferred_frames: tuple[tuple[int, int], ...]
     """First and last frame of each stretch in which the legs were mostly inferred."""
+    seated: tuple[Seated, ...]
+    """Stretches of frames without a knee or an ankle in view, each with the probability
+    that the person sits."""
     leg_px: float
     """Median length of a leg in the image, px."""
     speed_noise: float
@@ -97,6 +101,9 @@ def assess_person(
         reasons=tuple(reasons),
         not_measured=found.shares(person, present),
         inferred_frames=tuple((int(run.start), int(run.stop - 1)) for run in inferred),
+        seated=stretches(
+            result.joints[person], present & found.legs_unseen[person], sequence.fps
+        ),
         leg_px=leg_px,
         speed_noise=speed_noise,
     )
@@ -144,8 +151,9 @@ def reasons_of_people(people: list[PersonVerdict]) -> list[Reason]:
 
 
 def warnings_of_people(people: list[PersonVerdict]) -> list[str]:
-    """Returns a warning for each person who cannot be measured, and for each whose legs
-    are inferred in frames too few to make the person doubtful."""
+    """Returns a warning for each person who cannot be measured, for each whose legs are
+    inferred in frames too few to make the person doubtful, and for each of whom no leg
+    is in view, with the probability that the person sits."""
     lines = []
     for h, person in enumerate(people):
         if person.status == "not_measurable":
@@ -157,4 +165,11 @@ def warnings_of_people(people: list[PersonVerdict]) -> list[str]:
                 f"person {h}, frames {frames}: most of the legs are hidden or out of "
                 "the image; the posture is inferred there, not measured."
             )
+        lines += [
+            f"person {h}, frames {one.frames[0]} to {one.frames[1]}: no knee and no "
+            "ankle is in view, and legs are a guess; by how little the pelvis moves, "
+            f"the probability is {100 * one.probability:.0f} % that the person sits."
+            for one in person.seated
+            if person.status != "not_measurable"
+        ]
     return lines

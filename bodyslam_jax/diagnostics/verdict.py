@@ -94,7 +94,7 @@ def assess(
         up: the vertical of the result, and the cues that determined it.
     """
     scale_sigma = reported_sigma(result.scale, joint.scale_sigma, joint.start)
-    found = measured(sequence, joint, body)
+    found = measured(sequence, joint, body, result)
     # Feet and steps of hidden legs are guesses, which are not judged.
     legs = people_.legs_shown(found.keypoint, result.present, sequence.fps)
     stepping = dataclasses.replace(result, present=result.present & legs)

@@ -234,6 +234,10 @@ def _person(person: PersonVerdict, sure: PersonAccuracy) -> dict[str, Any]:
         "leg_px": known(person.leg_px),
         "not_measured": person.not_measured,
         "inferred_frames": [list(stretch) for stretch in person.inferred_frames],
+        "sitting": [
+            {"frames": list(one.frames), "probability": one.probability}
+            for one in person.seated
+        ],
     }
 
 

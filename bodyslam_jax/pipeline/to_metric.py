@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import people
-from bodyslam_jax.body.skeleton import FEET
+from bodyslam_jax.body.skeleton import FEET, NECK, PELVIS
 from bodyslam_jax.config import Config
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.geometry.lengths import lengthened, padded_length
@@ -40,7 +40,7 @@ def to_metric(
     landmarks = joint.scale * joint.landmarks
     standing = toes_standing(joint.contacts)
     cues = GravityCues(
-        trunks=(T_WC @ joint.roots)[..., :3, 1],
+        trunks=_trunks(sequence, body, joint, T_WC, joints),
         feet=joints[:, :, list(FEET)] - above[:, :, None],
         present=joint.present,
         eyes=T_WC[:, :3, 3],
@@ -77,6 +77,25 @@ def to_metric(
         present=joint.present,
     )
     return result, up
+
+
+def _trunks(
+    sequence: Sequence,
+    body: body_.BodyModel,
+    joint: JointEstimate,
+    T_WC: Float[np.ndarray, "t 4 4"],
+    joints: Float[np.ndarray, "h t 24 3"],
+) -> Float[np.ndarray, "h t 3"]:
+    """Returns the directions in which trunks point: the y axes of the roots, and from
+    pelvis to neck where legs are not shown, as nothing else holds the pelvis' pitch."""
+    trunks = (T_WC @ joint.roots)[..., :3, 1]
+    if not joint.present.any():
+        return trunks
+    shown = people.shown_keypoints(sequence, body)
+    legs = people.legs_shown(shown, joint.present, sequence.fps)
+    line = joints[:, :, NECK] - joints[:, :, PELVIS]
+    line = line / np.maximum(np.linalg.norm(line, axis=-1, keepdims=True), 1e-9)
+    return np.where(legs[..., None], trunks, line)
 
 
 _joints = eqx.filter_jit(body_.joints)
