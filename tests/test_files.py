@@ -44,7 +44,7 @@ OWN_FILES = {
     "export/formats/glb.py": "writes",
     "view/video_file.py": "writes, and counts what it wrote",
     "people/detect.py": "writes what it downloads",
-    "online/checkpoint.py": "its own state, unpickled by names of arrays and of this package",
+    "online/checkpoint.py": "its own state, by names of arrays and of the package",
     "cli/main.py": "standard output",
     "cli/unexpected.py": "writes",
     "graph/validation.py": "the system's own files",
