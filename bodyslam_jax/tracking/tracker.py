@@ -105,6 +105,8 @@ class Tracklet:
         if (sure & known).sum() >= _FEW_KEYPOINTS:
             moved = np.median((points - self.whole)[sure & known, :2], axis=0)
             share = 1 - np.exp(-gap / (_VELOCITY_SMOOTHING_S * self.fps))
+            if len(self.frames) == 1:
+                share = 1.0  # There is no velocity to smooth with yet.
             self.velocity = (1 - share) * self.velocity + share * moved / gap
         self.hidden = np.where(sure, 0, self.hidden + gap)
         kept = ~sure & known & (self.hidden <= self.max_gap) & self.kind.remembered
