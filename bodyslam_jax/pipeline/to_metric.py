@@ -87,15 +87,17 @@ def _trunks(
     joints: Float[np.ndarray, "h t 24 3"],
 ) -> Float[np.ndarray, "h t 3"]:
     """Returns the directions in which trunks point: the y axes of the roots, and from
-    pelvis to neck where legs are not shown, as nothing else holds the pelvis' pitch."""
+    pelvis to neck of people whose legs are not shown in most of their frames, as
+    nothing else holds the pelvis' pitch then."""
     trunks = (T_WC @ joint.roots)[..., :3, 1]
     if not joint.present.any():
         return trunks
     shown = people.shown_keypoints(sequence, body)
     legs = people.legs_shown(shown, joint.present, sequence.fps)
+    mostly = 2 * (legs & joint.present).sum(axis=1) >= joint.present.sum(axis=1)
     line = joints[:, :, NECK] - joints[:, :, PELVIS]
     line = line / np.maximum(np.linalg.norm(line, axis=-1, keepdims=True), 1e-9)
-    return np.where(legs[..., None], trunks, line)
+    return np.where(mostly[:, None, None], trunks, line)
 
 
 _joints = eqx.filter_jit(body_.joints)
