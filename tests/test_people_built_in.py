@@ -238,13 +238,10 @@ def test_blazeposes_square_is_upright_and_its_points_come_back(angle):
     assert inside[5, 1] < inside[11, 1] < inside[15, 1]
     raw = np.zeros((33, 5), np.float32)
     raw[blazepose.COCO_OF_LANDMARKS, :2] = inside + 0.5
-    world = np.zeros((33, 3), np.float32)
-    world[11] = (0.0, -0.5, 0.1)  # up in the square
-    pose = blazepose.decode(raw, 1.0, np.zeros((256, 256)), world, square)
+    pose = blazepose.decode(raw, 1.0, np.zeros((256, 256)), square)
     sure = points[:, 2] > 0
     away = blazepose.disagreement(pose, points)
     np.testing.assert_allclose(away[sure], 0, atol=1e-4)
-    np.testing.assert_allclose(pose.world[11, :2], 0.5 * square.up, atol=1e-6)
 
 
 def test_a_doubtful_wrist_that_blazepose_sees_is_blazeposes():
@@ -253,8 +250,8 @@ def test_a_doubtful_wrist_that_blazepose_sees_is_blazeposes():
     square = blazepose.Square(np.zeros(2), 250.0, np.array([0.0, -1.0]))
     landmarks = np.ones((33, 3))
     landmarks[[15, 16], 2] = 0.9, 0.2  # the right wrist is a guess
-    mask, world = np.zeros((256, 256), np.uint8), np.zeros((33, 3))
-    pose = blazepose.Pose(landmarks, 1.0, mask, square, world)
+    mask = np.zeros((256, 256), np.uint8)
+    pose = blazepose.Pose(landmarks, 1.0, mask, square)
     body = found_.as_body25(points, None, found_.find_wrists(pose, points))
     np.testing.assert_allclose(body[7], [1, 1, found_.SURE_WRIST])
     np.testing.assert_allclose(body[4], [0, 0, 0.5**3])
@@ -277,8 +274,8 @@ def test_feet_of_somebody_else_are_left_out():
     points = np.column_stack([np.zeros((17, 2)), np.full(17, 0.9)])
     square = blazepose.Square(np.zeros(2), 250.0, np.array([0.0, -1.0]))
     landmarks = np.column_stack([np.ones((33, 2)), np.full(33, 1.0)])
-    mask, world = np.zeros((256, 256), np.uint8), np.zeros((33, 3))
-    pose = blazepose.Pose(landmarks, 1.0, mask, square, world)
+    mask = np.zeros((256, 256), np.uint8)
+    pose = blazepose.Pose(landmarks, 1.0, mask, square)
     apart = np.zeros(17)
     apart[16] = 0.5  # the right ankle is elsewhere
     feet = found_.find_feet(pose, points, apart)

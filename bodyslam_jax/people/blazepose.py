@@ -64,9 +64,6 @@ class Pose:
     mask: UInt8[np.ndarray, "256 256"]
     """Mask in the square; 255 is person."""
     square: Square
-    world: Float[np.ndarray, "33 3"]
-    """Landmarks relative to the hips' midpoint, m, in the camera's axes (x right, y
-    down, z forward) as if the person were on the optical axis."""
 
 
 def turned_square(points: Float[np.ndarray, "17 3"], least: float) -> Square | None:
@@ -101,7 +98,6 @@ def read_pose(session: Any, image: UInt8[np.ndarray, "y x 3"], square: Square) -
         by_size[195].reshape(39, 5)[:NUM_LANDMARKS],
         float(by_size[1].reshape(())),
         by_size[INPUT_SIDE_PX**2].reshape(INPUT_SIDE_PX, INPUT_SIDE_PX),
-        by_size[117].reshape(39, 3)[:NUM_LANDMARKS],
         square,
     )
 
@@ -110,31 +106,25 @@ def decode(
     raw: Float[np.ndarray, "33 5"],
     presence: float,
     mask: Float[np.ndarray, "256 256"],
-    world: Float[np.ndarray, "33 3"],
     square: Square,
 ) -> Pose:
-    """Converts the network's raw outputs to the image's and the camera's axes.
+    """Converts the network's raw outputs to the image's axes.
 
     Args:
         raw: x, y (px of the square, from its upper left edge), z, logits of visibility
             and presence.
         mask: logits.
-        world: m, in the square's axes.
     """
     from_image = square.from_image()
     xy = raw[:, :2].astype(float) - 0.5  # from edges to pixel centres
     turn, shift = from_image[:, :2], from_image[:, 2]
     uv = (xy - shift) @ np.linalg.inv(turn).T
     visible = _sigmoid(np.minimum(raw[:, 3], raw[:, 4]).astype(float))
-    rotation = turn / (INPUT_SIDE_PX / square.side)
-    metric = world.astype(float).copy()
-    metric[:, :2] = metric[:, :2] @ rotation
     return Pose(
         np.column_stack([uv, visible]),
         presence,
         np.where(mask > 0, 255, 0).astype(np.uint8),
         square,
-        metric,
     )
 
 
