@@ -24,14 +24,3 @@ from bodyslam_jax.experiments.scenario import errors as errors
 from bodyslam_jax.experiments.scenario import score as score
 from bodyslam_jax.experiments.scenario import score_of as score_of
 from bodyslam_jax.experiments.scenario import without_map as without_map
-from bodyslam_jax.experiments.weights import WEIGHTS as WEIGHTS
-from bodyslam_jax.experiments.weights import Learned as Learned
-from bodyslam_jax.experiments.weights import Trial as Trial
-from bodyslam_jax.experiments.weights import error_and_gradient as error_and_gradient
-from bodyslam_jax.experiments.weights import judge as judge
-from bodyslam_jax.experiments.weights import learn_weights as learn_weights
-from bodyslam_jax.experiments.weights import make_trial as make_trial
-from bodyslam_jax.experiments.weights import names_of as names_of
-from bodyslam_jax.experiments.weights import outcome as outcome
-from bodyslam_jax.experiments.weights import reweighted as reweighted
-from bodyslam_jax.experiments.weights import training_error as training_error
