@@ -26,7 +26,7 @@ from bodyslam_jax.graph.factors.ground_contact import GroundContact
 from bodyslam_jax.graph.factors.keypoint_reprojection import KeypointReprojection
 from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior
 from bodyslam_jax.graph.factors.reprojection import LandmarkPrior, Reprojection
-from bodyslam_jax.graph.factors.root_orientation import RootOrientation, UprightPrior
+from bodyslam_jax.graph.factors.root_orientation import RootOrientation
 from bodyslam_jax.graph.factors.root_position_prior import RootPositionPrior
 from bodyslam_jax.graph.layout import Layout
 from bodyslam_jax.graph.ordering import CHUNK
@@ -118,8 +118,6 @@ def check_measurements(factor: Factor, sizes: Sizes) -> None:
         _check_rotations(factor.cameras, f"{name}.cameras", measured)
     if isinstance(factor, GroundContact):
         _check_unit(factor.normal, f"{name}.normal")
-    if isinstance(factor, UprightPrior):
-        _check_unit(factor.up, f"{name}.up")
     if isinstance(factor, RootPositionPrior) and not is_traced(factor.position):
         depth = np.asarray(factor.position)[..., 2][_measured(factor.sigma)]
         if not (depth > 0).all():
