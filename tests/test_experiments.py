@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import importlib
 import json
 import math
 import shutil
@@ -512,9 +511,6 @@ def few(tmp_path, monkeypatch):
     name = "errors of frames independent"
     monkeypatch.setattr(ablation, "SETTINGS", {name: ablation.SETTINGS[name]})
     monkeypatch.setattr(plans, "NOISE_LEVELS", ("low",))
-    # The package exports the function of this module's name.
-    solve = importlib.import_module("bodyslam_jax.solver.solve")
-    monkeypatch.setattr(solve, "PAPER_STEPS", (20, 20))
     file = tmp_path / "own.npz"
     shutil.copy(Path(motion.__file__).parent / "assets" / "default.npz", file)
     return str(file)
@@ -567,9 +563,6 @@ def test_every_plan_on_forty_frames(tmp_path, few, caplog):
     assert own["past"] == full["past"] == motion.load_motion_model(few).past
     assert own["j_ate_se3"] == pytest.approx(full["j_ate_se3"], rel=1e-3)
     assert full["c_ate_se3"] < 0.01 < ablated["no landmarks"]["c_ate_se3"]
-    first, *others = (ablated[order]["cost"] for order in ablation.ORDERS)
-    assert first == pytest.approx(full["cost"], rel=1e-3) and first < min(others)
     known = {"converged", "no such term"}
-    first_order = lambda name: "order" in name or name == ablation.PUBLISHED
-    solved = [row for name, row in ablated.items() if not first_order(name)]
+    solved = [row for name, row in ablated.items() if name != ablation.PUBLISHED]
     assert {row["status"] for row in solved} <= known

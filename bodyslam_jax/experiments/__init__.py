@@ -9,7 +9,6 @@ from bodyslam_jax.config import Experiment as Experiment
 from bodyslam_jax.experiments.ablation import VARIANTS as VARIANTS
 from bodyslam_jax.experiments.ablation import ablate as ablate
 from bodyslam_jax.experiments.ablation import as_published as as_published
-from bodyslam_jax.experiments.ablation import compare_orders as compare_orders
 from bodyslam_jax.experiments.ablation import landmark_ablation as landmark_ablation
 from bodyslam_jax.experiments.ablation import with_motion_model as with_motion_model
 from bodyslam_jax.experiments.ablation import with_weights as with_weights

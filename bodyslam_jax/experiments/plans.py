@@ -129,8 +129,8 @@ def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
 
 def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Plans the ablations: disabled and added factors, other weights, noise levels,
-    solvers."""
+    """Plans the ablations: disabled factors, other weights and models, noise
+    levels."""
     case = cases(config, stages)
 
     @functools.lru_cache(maxsize=1)
@@ -140,10 +140,10 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
     jobs: list[Job] = []
     begun: set[Simulation] = set()
 
-    def add(settings: Simulation, label: str, compute, solves=1.0, extra=()):
+    def add(settings: Simulation, label: str, compute, extra=()):
         name = named(settings)
         row = lambda: {"sequence": name, "label": label, **compute()}
-        seconds = cost(settings, solves, solves)
+        seconds = cost(settings, 1.0, 1.0)
         if settings in begun:
             seconds -= cost(settings, 0.0, 0.0)  # stages before the solve are cached
         begun.add(settings)
@@ -161,11 +161,6 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
         for file in experiment.motion_models:
             one = lambda s=s, f=file: ablation_.with_motion_model(case(s), f)
             add(s, f"motion model {Path(file).stem}", one, extra=(Path(file),))
-        orders = functools.lru_cache(maxsize=1)(
-            lambda s=s: ablation_.compare_orders(case(s), prepared(s))
-        )
-        for order in ablation_.ORDERS:
-            add(s, order, lambda o=order, f=orders: f()[o], solves=2.0)
         for noise in NOISE_LEVELS:
             quiet = dataclasses.replace(s, noise=noise)
             one = lambda q=quiet: ablation_.ablate(case(q), prepared(q), FULL)

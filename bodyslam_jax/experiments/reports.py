@@ -194,8 +194,8 @@ def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     head = intro(
         "Ablations",
         about,
-        "`seconds` are wall time with compilation, but processor time without it for "
-        "the three rows on orders. `past frames` are those that the motion model sees.",
+        "`seconds` are wall time with compilation. `past frames` are those that the "
+        "motion model sees.",
     )
     files = write_tables(out, "ablation", head, parts, about)
     everything = to_csv([Column("sequence", "sequence"), *columns], rows, about)
