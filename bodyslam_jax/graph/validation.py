@@ -69,6 +69,7 @@ def check_state(state: State, free: Step | None = None) -> Sizes:
     _check_precision(state, free)
     if not sizes["t"]:
         raise ValueError("state.cameras: 0 frames, expected 1 or more.")
+    # fx fy cx cy, or with the four distortion coefficients of OPENCV.
     if sizes["i"] not in (4, 8):
         raise ValueError(f"state.intrinsics: {sizes['i']} numbers, expected 4 or 8.")
     _check_values(state, "state")
