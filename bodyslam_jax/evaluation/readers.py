@@ -88,6 +88,7 @@ def read_result(path: Path) -> Result:
     }
     if fields["timestamps"].size == 0 or (np.diff(fields["timestamps"]) <= 0).any():
         raise InputError(f"{file}: `timestamps` do not increase, or there is none.")
+    # fx fy cx cy, or with the four distortion coefficients of OPENCV.
     if len(fields["intrinsics"]) not in (4, 8) or (fields["intrinsics"][:2] <= 0).any():
         raise InputError(
             f"{file}: `intrinsics` are {fields['intrinsics'][:8].tolist()}, expected "
