@@ -333,9 +333,10 @@ def test_command_takes_finished_rows(tmp_path, monkeypatch, capsys, caplog):
 @pytest.fixture
 def made_up(monkeypatch):
     """Two sequences of `table1`, computed at once: their settings, and which were."""
-    real, computed = PLANS["table1"], []
+    real, computed, lifters = PLANS["table1"], [], []
 
     def plan(*given):
+        lifters.append(given[1].people_fit.lifter)
         found = real(*given)
 
         def compute(job):
@@ -349,7 +350,9 @@ def made_up(monkeypatch):
         return dataclasses.replace(found, jobs=jobs)
 
     monkeypatch.setitem(PLANS, "table1", plan)
-    return Experiment(sequences=("E1", "M2"), family="room", frames=300), computed
+    yield Experiment(sequences=("E1", "M2"), family="room", frames=300), computed
+    # Simulated people are never estimated by a network that has learnt from them.
+    assert set(lifters) == {"held-out"}
 
 
 @pytest.fixture
@@ -399,7 +402,9 @@ def test_tables_say_what_is_not_as_by_default(tmp_path, made_up, monkeypatch):
     named = lambda setting: setting and Path(setting)
     monkeypatch.setattr(reports, "body_model_file", named)
     plain = reports.about(Experiment(), Config())
-    assert plain == "Simulated sequences, noise level `real`."
+    assert plain == (
+        "Simulated sequences, noise level `real`, lifting network `everybody`."
+    )
     weights = dataclasses.replace(Config().weights, pixel_sigma=2.0)
     config = Config(weights=weights, motion_model="m.npz", body_model="b.npz")
     assert reports.about(Experiment(motion="walk.npz"), config) == (
@@ -414,6 +419,7 @@ def test_tables_say_what_is_not_as_by_default(tmp_path, made_up, monkeypatch):
         again = dataclasses.replace(on, seed=seed)
         experiments.run_experiment("table1", tmp_path, again)
         text = (tmp_path / "table1.md").read_text()
+        assert "noise level `real`, lifting network `held-out`." in text
         assert f"Not as by default: seed {seed}; 300 frames each. Ours:" in text
 
 

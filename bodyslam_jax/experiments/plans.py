@@ -207,7 +207,8 @@ def run_experiment(
     Rows are cached in `out/rows` under a fingerprint of their inputs, stages before the
     joint estimate in `out/stages`. Tables are written after every row, so that an
     interrupted experiment leaves those of the finished rows. A row that cannot be
-    computed is left out with a warning.
+    computed is left out with a warning. Networks are those that have not been trained
+    on the simulated people (`Config.for_simulated_people`), whatever `config` says.
 
     Args:
         engine: computes the rows elsewhere, in processes that `setup` prepares; `out`
@@ -220,6 +221,7 @@ def run_experiment(
     if name not in PLANS:
         raise InputError(f"no experiment {name!r}; expected one of {sorted(PLANS)}.")
     check_files(experiment, config)
+    config = config.for_simulated_people()
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

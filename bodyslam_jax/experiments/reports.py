@@ -206,13 +206,16 @@ def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
 def about(experiment: Experiment, config: Config) -> str:
     """Returns a sentence or two on simulation and settings of the rows of an
     experiment."""
-    first = f"Simulated sequences, noise level `{experiment.noise}`."
+    first = (
+        f"Simulated sequences, noise level `{experiment.noise}`, lifting network "
+        f"`{config.people_fit.lifter}`."
+    )
     return f"{first} {deviations(experiment, config)}".rstrip()
 
 
 def deviations(experiment: Experiment, config: Config) -> str:
     """Returns text on seed, length, motion, models and settings that differ from the
-    defaults.
+    defaults, but for the lifting network, which experiments choose.
 
     Settings are compared with the nearest preset. A body model that is installed on
     this machine counts as named by the user. The text is empty if nothing differs.
@@ -227,7 +230,13 @@ def deviations(experiment: Experiment, config: Config) -> str:
     body = body_model_file(config.body_model)
     config = dataclasses.replace(config, body_model=None if body is None else str(body))
     mine = dict(_flat(config))
-    against = {"default": Config(), "paper": Config.paper()}
+    same = lambda preset: dataclasses.replace(
+        preset,
+        people_fit=dataclasses.replace(
+            preset.people_fit, lifter=config.people_fit.lifter
+        ),
+    )
+    against = {"default": same(Config()), "paper": same(Config.paper())}
     differing = {
         preset: [f"`{k}` {mine[k]}" for k, v in _flat(theirs) if mine[k] != v]
         for preset, theirs in against.items()
