@@ -62,7 +62,7 @@ def inflate_fitted_shapes(
             lengths, whose errors are independent.
     """
     weight = np.maximum(shape_sigma**-2.0, 1.0)
-    more = weight * (weight - 1)
+    more = jnp.asarray(weight * (weight - 1))
     extra = more[:, None, None] * (shape_covariance @ shape_covariance)
     legs = leg_variance(body, shapes, extra)
     variance = (

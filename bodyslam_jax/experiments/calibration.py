@@ -338,7 +338,7 @@ def _of_places(result: Result, scene: sequences.SimulatedSequence) -> Row:
 def in_world(truth: Result, room: Room) -> tuple[Float[np.ndarray, "h t 24 3"], float]:
     """Returns the true joints in W, m, and the true height of the first camera over the
     floor, m."""
-    height = room.height if isinstance(room, Terrain) else floor_of(("level", 0, 0))
+    height = room.height if isinstance(room, Terrain) else floor_of(("level", 0.0, 0.0))
     feet = truth.joints[:, :, list(FEET)]
     places = np.concatenate(find_stances(feet, truth.present, truth.fps))
     places = places if len(places) else feet.reshape(-1, 3)

@@ -278,8 +278,8 @@ def estimate_uncertainty(
         np.asarray(shapes),
         tuple(unobserved),
         statures,
-        marginals,
-        _root_covariance(prepared, best, marginals, hidden),
+        root_covariance=_root_covariance(prepared, best, marginals, hidden),
+        marginals=marginals,
     )
 
 
