@@ -41,6 +41,10 @@ def write(path: Path, scene: Scene) -> None:
             columns[f"{name}_{'xyz'[axis]}_m"] = joints[:, k, axis]
         if result.joint_sigma is not None:
             columns[f"{name}_sigma_m"] = result.joint_sigma[0, :, k]
+    if result.root_sigma is not None:
+        for axis in range(3):
+            name = f"{JOINT_NAMES[PELVIS]}_place_{'xyz'[axis]}_sigma_m"
+            columns[name] = result.root_sigma[0, :, axis]
     turns = so3.exp(result.poses[0].reshape(len(joints), 24, 3))
     vertical = np.eye(3)[1 if scene.up == "y" else 2]
     columns |= angles(turns, joints, vertical)
