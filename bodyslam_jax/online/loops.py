@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.io.camera.calibration import as_opencv
-from bodyslam_jax.online.window import Solved
+from bodyslam_jax.online.window import SCALE_WALK, Solved
 from bodyslam_jax.online.window_content import FRAMES
 from bodyslam_jax.sfm.places import Place, sighting
 from bodyslam_jax.sfm.pose_graph import Edge, Nodes, PoseGraph
@@ -30,7 +30,7 @@ _MAX_PLACES = 100
 two seconds, and more where places are seen again."""
 _NUM_RECENT = 30
 """Number of newest keyframes that keep their descriptors: a minute."""
-_WALK = np.array([0.003] * 3 + [0.01] * 3 + [0.015])
+_WALK = np.array([0.003] * 3 + [0.01] * 3 + [SCALE_WALK])
 """Standard deviation of the drift in a second: rotation (rad), translation over depth,
 and logarithm of the unit; above what is measured in a rendered room
 (`benchmarks/online.md`)."""

@@ -20,7 +20,7 @@ _MIN_INLIERS, _MIN_SHARE = 30, 0.5
 _MIN_CELLS, _NUM_CELLS = 6, 4
 """Least number of cells, of as many by as many over the image of the matches' place,
 that have such points: a picture on two walls fills few."""
-_MIN_SIGMA = np.array([0.001] * 3 + [0.003] * 4)
+_MIN_SIGMA = np.array([0.001] * 3 + [0.003] * 3 + [0.01])
 """Least standard deviations of rotation (rad), of translation over depth, and of the
 ratio of units: errors that all points of a place have in common."""
 
