@@ -173,7 +173,9 @@ class Loops:
         end = windows[-1].first + len(windows[-1].times)
         first = len(self.keyframes)
         while self.new and self.new[0].slot < end:
-            self.keyframes.append(self.new.popleft())
+            # In this order: `places` of another thread has it all the time.
+            self.keyframes.append(self.new[0])
+            self.new.popleft()
         for solved in windows:
             self._take(solved)
         found = []
