@@ -9,7 +9,7 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.online.loops import NO_CORRECTION, Correction, Loops
 from bodyslam_jax.online.window import Solved
 from bodyslam_jax.sfm.places import Place, sighting
-from bodyslam_jax.sfm.pose_graph import Edge, Nodes, PoseGraph, residual
+from bodyslam_jax.sfm.pose_graph import Edge, Nodes, PoseGraph, residuals
 from bodyslam_jax.types import Intrinsics
 
 CAMERA = Intrinsics(np.array([500.0, 500.0, 319.5, 239.5]), 640, 480)
@@ -31,7 +31,7 @@ def ring(count: int) -> np.ndarray:
 def measured(nodes: Nodes, a: int, b: int, loop: bool = False) -> Edge:
     """The edge that fits two cameras exactly."""
     blank = Edge(a, b, np.eye(4), 0.0, np.diag([1e-4] * 7), loop)
-    r, _ = residual(nodes, blank)
+    r = residuals(nodes, [blank])[0][0]
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = nodes.R[a].T @ nodes.R[b], r[3:6]
     return dataclasses.replace(blank, T=T, log_ratio=float(r[6]))
@@ -58,12 +58,12 @@ def test_a_graph_finds_the_cameras_that_its_edges_measure():
 def test_derivatives_of_an_edge_are_those_of_its_error():
     nodes = truth()
     edge = measured(nodes, 2, 5)
-    r, J = residual(nodes, edge)
+    r, J = (x[0] for x in residuals(nodes, [edge]))
     np.testing.assert_allclose(r, 0, atol=1e-12)
     for k in range(14):
         step = np.zeros((8, 7))
         step[(2, 5)[k // 7], k % 7] = 1e-6
-        later, _ = residual(nodes.move(step), edge)
+        later = residuals(nodes.move(step), [edge])[0][0]
         np.testing.assert_allclose((later - r) / 1e-6, J[:, k], atol=1e-5)
 
 

@@ -61,29 +61,29 @@ class Nodes:
         )
 
 
-def residual(
-    nodes: Nodes, edge: Edge
-) -> tuple[Float[np.ndarray, " 7"], Float[np.ndarray, "7 14"]]:
-    """Returns the error of an edge, and its derivative by the steps of both cameras
+def residuals(
+    nodes: Nodes, edges: list[Edge]
+) -> tuple[Float[np.ndarray, "k 7"], Float[np.ndarray, "k 7 14"]]:
+    """Returns the errors of edges, and their derivatives by the steps of both cameras
     (of the rotation, for small errors)."""
-    a, b = edge.a, edge.b
-    turn = nodes.R[a].T @ nodes.R[b]
-    unit = np.exp(-(nodes.log_unit[a] + nodes.log_unit[b]) / 2)
-    into = unit * nodes.R[a].T
-    p = into @ (nodes.t[b] - nodes.t[a])
-    r = np.concatenate(
-        [
-            so3.log(edge.T[:3, :3].T @ turn),
-            p - edge.T[:3, 3],
-            [nodes.log_unit[b] - nodes.log_unit[a] - edge.log_ratio],
-        ]
-    )
-    J = np.zeros((7, 14))
-    J[:3, :3], J[:3, 7:10] = -turn.T, np.eye(3)
-    J[3:6, :3] = np.array([[0, -p[2], p[1]], [p[2], 0, -p[0]], [-p[1], p[0], 0]])
-    J[3:6, 3:6], J[3:6, 10:13] = -into, into
-    J[3:6, 6] = J[3:6, 13] = -p / 2
-    J[6, 6], J[6, 13] = -1.0, 1.0
+    a, b = np.array([e.a for e in edges]), np.array([e.b for e in edges])
+    T = np.array([e.T for e in edges])
+    into = np.swapaxes(nodes.R[a], 1, 2)
+    turn = into @ nodes.R[b]
+    ratio = nodes.log_unit[b] - nodes.log_unit[a]
+    into = into * np.exp(-nodes.log_unit[a] - ratio / 2)[:, None, None]
+    p = (into @ (nodes.t[b] - nodes.t[a])[..., None])[..., 0]
+    r = np.zeros((len(edges), 7))
+    r[:, :3] = so3.log(np.swapaxes(T[:, :3, :3], 1, 2) @ turn)
+    r[:, 3:6] = p - T[:, :3, 3]
+    r[:, 6] = ratio - np.array([e.log_ratio for e in edges])
+    J = np.zeros((len(edges), 7, 14))
+    J[:, :3, :3], J[:, :3, 7:10] = -np.swapaxes(turn, 1, 2), np.eye(3)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        J[:, 3 + i, j], J[:, 3 + i, k] = -p[:, k], p[:, j]
+    J[:, 3:6, 3:6], J[:, 3:6, 10:13] = -into, into
+    J[:, 3:6, 6] = J[:, 3:6, 13] = -p / 2
+    J[:, 6, 6], J[:, 6, 13] = -1.0, 1.0
     return r, J
 
 
@@ -92,7 +92,11 @@ class PoseGraph:
 
     def __init__(self, nodes: Nodes, edges: list[Edge]) -> None:
         self.nodes, self.edges = nodes, edges
-        self.information = [np.linalg.inv(e.covariance) for e in edges]
+        self.information = np.linalg.inv(np.array([e.covariance for e in edges]))
+        self.loop = np.array([e.loop for e in edges])
+        own = np.array([[e.a, e.b] for e in edges])
+        self.rows = (7 * own[..., None] + np.arange(7)).reshape(-1, 14)
+        """Index of each component of the two cameras of an edge."""
 
     def solve(self) -> Nodes:
         """Returns the most probable cameras (Gauss--Newton; weights of loops are those
@@ -110,31 +114,29 @@ class PoseGraph:
         their own covariance and that of their prediction from the graph."""
         factor, _ = self._factorised()
         found = np.zeros(len(edges))
-        for k, edge in enumerate(edges):
-            r, J = residual(self.nodes, edge)
+        for k, (r, J) in enumerate(zip(*residuals(self.nodes, edges), strict=True)):
             columns = np.zeros((7 * len(self.nodes.t), 7))
-            columns[7 * edge.a : 7 * edge.a + 7] = J[:, :7].T
-            columns[7 * edge.b : 7 * edge.b + 7] += J[:, 7:].T
+            a, b = 7 * edges[k].a, 7 * edges[k].b
+            columns[a : a + 7], columns[b : b + 7] = J[:, :7].T, J[:, 7:].T
             spread = columns[7:].T @ factor.solve(columns[7:])
-            found[k] = r @ np.linalg.solve(spread + edge.covariance, r)
+            found[k] = r @ np.linalg.solve(spread + edges[k].covariance, r)
         return found
 
     def _factorised(self) -> tuple[SuperLU, Float[np.ndarray, " m"]]:
         """Returns the factorised information matrix of all cameras but the first, and
         the gradient."""
+        r, J = residuals(self.nodes, self.edges)
+        squared = np.einsum("ki,kij,kj->k", r, self.information, r)
+        weight = np.where(self.loop, 1 / (1 + squared / _WIDTH), 1.0)
+        pulled = np.swapaxes(J, 1, 2) @ (self.information * weight[:, None, None])
         size = 7 * len(self.nodes.t)
-        slope, rows, blocks = np.zeros(size), [], []
-        for edge, weight in zip(self.edges, self.information, strict=True):
-            r, J = residual(self.nodes, edge)
-            if edge.loop:
-                weight = weight / (1 + r @ weight @ r / _WIDTH)
-            own = [np.arange(7 * k, 7 * k + 7) for k in (edge.a, edge.b)]
-            at = np.concatenate(own)
-            slope[at] += J.T @ weight @ r
-            rows.append(at)
-            blocks.append(J.T @ weight @ J)
-        at = np.array(rows)
-        i, j = np.broadcast_arrays(at[:, :, None], at[:, None, :])
-        shape = size, size
-        matrix = sparse.coo_matrix((np.ravel(blocks), (i.ravel(), j.ravel())), shape)
-        return splu(matrix.tocsc()[7:, 7:]), slope[7:]
+        slope = np.zeros(size)
+        np.add.at(slope, self.rows, (pulled @ r[..., None])[..., 0])
+        blocks = pulled @ J
+        i, j = np.broadcast_arrays(self.rows[:, :, None], self.rows[:, None, :])
+        entries = blocks.ravel(), (i.ravel(), j.ravel())
+        matrix = sparse.coo_matrix(entries, (size, size))
+        # The matrix is symmetric and positive definite: no pivots, ordered as such.
+        given = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0}
+        options = {"SymmetricMode": True}
+        return splu(matrix.tocsc()[7:, 7:], **given, options=options), slope[7:]
