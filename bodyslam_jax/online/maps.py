@@ -45,6 +45,11 @@ _RELOCALISATION_INTERVAL = 3
 """Frames between two attempts to relocalise a lost camera."""
 _MAX_LOST_S = 2.0
 """Time after which a lost camera that sees points begins a new map, s."""
+_MAX_REST_S = 1.0
+"""Longest time that the window rests, s: it rests as long as it took, so that the front
+end has one and a half of two cores, and once the scale is known (before, metres wait for
+it). By the time of the video, so that it does not depend on the machine without a second
+thread."""
 _MAX_WAITING_FRAMES = 10 * CHUNK
 """Largest number of frames that wait for the window when it begins with them. Of more
 frames it takes the newest, and the others keep the cameras that the map located."""
@@ -95,12 +100,17 @@ class Maps:
         self.step = self.stride / fps
         self.pool = ThreadPoolExecutor(1) if threads else None
         self.job: Future[list[Solved]] | None = None
+        self.now = self.submitted = self.rested = -np.inf
+        """Times of the frame that is processed, of the one after which the window began,
+        and from which it may begin again, s."""
         self.bodies = LiveBodies(config, body, fps)
         self.counts, self.record = Counts(), Record()
         self.warnings: dict[str, None] = {}
         self.seconds: dict[str, float] = {}
         self.number = -1
         """Number of the current map."""
+        self.origin = 0.0
+        """Time of the first frame, s."""
         self.keeps_points = False
         """True if the points of all frames are recorded, for `smooth`."""
 
@@ -136,7 +146,7 @@ class Maps:
     def _next_map(self) -> None:
         """Counts a new map, and resets what belongs to one."""
         self.number += 1
-        self.slots = Slots(self.step)
+        self.slots = Slots(self.step, self.origin)
         self.lost_since: float | None = None
         self.last_place = -np.inf
         self.solved: Solved | None = None
@@ -367,8 +377,8 @@ class Maps:
     # The window.
 
     def _submit(self, flush: bool) -> None:
-        """Passes the waiting frames to the window, if it is idle."""
-        if self.job is not None:
+        """Passes the waiting frames to the window, if it is idle and rested."""
+        if self.job is not None or (self.now < self.rested and not flush):
             return
         if flush:
             self.slots.fill(self.map.T_WC)
@@ -382,6 +392,7 @@ class Maps:
         if not count:
             return
         frames = [measured for _, measured in self.slots.pop(count)]
+        self.submitted = self.now
         if self.pool is not None:
             self.job = self.pool.submit(self.window.advance, frames)
         else:
@@ -395,6 +406,9 @@ class Maps:
             return
         windows = self.job.result()
         self.job = None
+        if np.isfinite(windows[-1].scale_sigma):
+            took = self.now - self.submitted
+            self.rested = self.now + min(took, _MAX_REST_S)
         for solved in windows:
             self.record.keep(self.number, solved)
             self.world.learn(solved, self.body)

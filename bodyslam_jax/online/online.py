@@ -58,7 +58,8 @@ class Online(Maps):
             solved in it, so that the same frames give the same estimates.
         - `name`: of the video, for the summary.
         - `smooth`: whether the points of all frames are recorded, which the method
-            `smooth` needs.
+            `smooth` needs. Without `threads`, the networks then look for people in
+            every frame, in place of one in a tenth of a second.
 
         **Raises:** `InputError` if the body model or the motion model cannot be read.
         """
@@ -70,6 +71,9 @@ class Online(Maps):
         super().__init__(config, body, fps, places, threads)
         self.intrinsics, self.name = intrinsics, name
         self.keeps_points = smooth
+        self.looks_always = smooth and not threads
+        self.looked: int | None = None
+        """Slot in which people were last looked for."""
         self.notes: list[str] = []
         """Lines of `warn`: they apply to the result of `smooth` too."""
         self.latest: Estimate | None = None
@@ -137,23 +141,27 @@ class Online(Maps):
                 self.latest, status="late", latency=time.perf_counter() - begun
             )
         if not self.started:
-            self._start(image)
+            self._start(image, timestamp)
+        self.now = timestamp
         assert self.intrinsics is not None
         if image is None and points is None:
             raise InputError("update: found neither an image nor points.")
-        people = self.bodies.find(image, keypoints)
+        looks = keypoints is not None or self._is_time_to_look(timestamp)
+        people = self.bodies.find(timestamp, image, keypoints) if looks else {}
         gray = None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if points is None:
             assert gray is not None
-            points = self.follower.advance(
-                gray, self.bodies.mask(people, self.intrinsics)
-            )
+            masked = people if looks else self.bodies.found.expected(timestamp)
+            mask = self.bodies.mask(masked, self.intrinsics)
+            points = self.follower.advance(gray, mask)
         self._collect(wait=False)
         status = self._locate(timestamp, gray, *points, people)
         shapes = self.record.shapes
-        bodies = self.bodies.follow(timestamp, people, self.intrinsics, shapes)
+        given = timestamp, people, self.intrinsics, shapes
+        bodies = self.bodies.follow(*given) if looks else self.bodies.predict(timestamp)
         self._submit(flush=False)
         self.counts.frames += 1
+        self.counts.looks += looks
         self.latest = self._estimate(timestamp, status, bodies)
         elapsed = time.perf_counter() - begun
         self.latest = dataclasses.replace(self.latest, latency=elapsed)
@@ -245,12 +253,19 @@ class Online(Maps):
 
     # Parts of a frame.
 
-    def _start(self, image: np.ndarray | None) -> None:
+    def _is_time_to_look(self, timestamp: float) -> bool:
+        """Returns whether the networks look for people in this frame: in the first one
+        of each slot of the window, which is the one that the window gets."""
+        before, self.looked = self.looked, self.slots.number(timestamp)
+        return self.looks_always or before != self.looked
+
+    def _start(self, image: np.ndarray | None, timestamp: float) -> None:
         if self.intrinsics is None:
             if image is None:
                 raise InputError("intrinsics: found none, nor an image to guess from.")
             self.intrinsics = self._guess(image.shape[1], image.shape[0])
         self.prepare()
+        self.origin = timestamp
         self._begin(self.intrinsics)
         self.started = True
 

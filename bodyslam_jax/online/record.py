@@ -65,6 +65,8 @@ class Counts:
 
     frames: int = 0
     """Number of frames that were used."""
+    looks: int = 0
+    """Number of frames in which people were looked for."""
     late: int = 0
     """Number of frames whose time is not after that of the one before."""
     lost: int = 0
