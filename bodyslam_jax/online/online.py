@@ -58,8 +58,7 @@ class Online(Maps):
             solved in it, so that the same frames give the same estimates.
         - `name`: of the video, for the summary.
         - `smooth`: whether the points of all frames are recorded, which the method
-            `smooth` needs. Without `threads`, the networks then look for people in
-            every frame, in place of one in a tenth of a second.
+            `smooth` needs.
 
         **Raises:** `InputError` if the body model or the motion model cannot be read.
         """
@@ -71,7 +70,6 @@ class Online(Maps):
         super().__init__(config, body, fps, places, threads)
         self.intrinsics, self.name = intrinsics, name
         self.keeps_points = smooth
-        self.looks_always = smooth and not threads
         self.looked: int | None = None
         """Slot in which people were last looked for."""
         self.notes: list[str] = []
@@ -147,18 +145,21 @@ class Online(Maps):
         if image is None and points is None:
             raise InputError("update: found neither an image nor points.")
         looks = keypoints is not None or self._is_time_to_look(timestamp)
-        people = self.bodies.find(timestamp, image, keypoints) if looks else {}
+        people = self.bodies.find(timestamp, image, keypoints) if looks else None
         gray = None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if points is None:
             assert gray is not None
-            masked = people if looks else self.bodies.found.expected(timestamp)
-            mask = self.bodies.mask(masked, self.intrinsics)
+            shown = self.bodies.found.expected(timestamp) if people is None else people
+            mask = self.bodies.mask(shown, self.intrinsics)
             points = self.follower.advance(gray, mask)
         self._collect(wait=False)
         status = self._locate(timestamp, gray, *points, people)
         shapes = self.record.shapes
-        given = timestamp, people, self.intrinsics, shapes
-        bodies = self.bodies.follow(*given) if looks else self.bodies.predict(timestamp)
+        if people is None:
+            bodies = self.bodies.predict(timestamp)
+        else:
+            given = timestamp, people, self.intrinsics, shapes
+            bodies = self.bodies.follow(*given)
         self._submit(flush=False)
         self.counts.frames += 1
         self.counts.looks += looks
@@ -187,6 +188,7 @@ class Online(Maps):
             self.name,
             1 / self.step,
             (*self.warnings, *self.counts.notes()),
+            self.fps,
         )
         if TWO_MAPS in self.warnings:
             measured = dataclasses.replace(measured, contradictions=(TWO_MAPS,))
@@ -224,7 +226,9 @@ class Online(Maps):
         """Returns the sequence with the frames of the file, if there is one."""
         if self.video is None:
             return measured
-        picks = np.array(self.picks, int)
+        used = np.array([frame.time for frame in self.record.frames])
+        at = measured.timestamps + used[0]
+        picks = np.rint(np.interp(at, used, self.picks)).astype(int)
         return dataclasses.replace(measured, frames=self.video, picks=picks)
 
     def warn(self, note: str) -> None:
@@ -257,7 +261,7 @@ class Online(Maps):
         """Returns whether the networks look for people in this frame: in the first one
         of each slot of the window, which is the one that the window gets."""
         before, self.looked = self.looked, self.slots.number(timestamp)
-        return self.looks_always or before != self.looked
+        return before != self.looked
 
     def _start(self, image: np.ndarray | None, timestamp: float) -> None:
         if self.intrinsics is None:
