@@ -192,11 +192,11 @@ def test_people_keep_their_numbers_in_any_order_and_after_a_gap():
     numbers: list[tuple[int, int]] = []
     for k in range(60):
         if 30 <= k < 40:
-            assert people.given(np.zeros((0, 25, 3))) == {}
+            assert people.given(np.zeros((0, 25, 3)), k / 30) == {}
             continue
         both = [walker(150 + 2 * k), walker(450 - k)]
         order = [0, 1] if k % 2 else [1, 0]
-        found = people.given(np.array([both[i] for i in order]))
+        found = people.given(np.array([both[i] for i in order]), k / 30)
         by_place = {round(x[:, 0].mean()) < 300: n for n, x in found.items()}
         if k > 10 and len(by_place) == 2:
             numbers.append((by_place[True], by_place[False]))

@@ -36,6 +36,7 @@ class LiveBodies:
 
     def find(
         self,
+        timestamp: float,
         image: UInt8[np.ndarray, "y x 3"] | None,
         keypoints: Float[np.ndarray, "p 25 3"] | None,
     ) -> dict[int, Float[np.ndarray, "25 3"]]:
@@ -44,10 +45,10 @@ class LiveBodies:
         if not self.config.people:
             return {}
         if keypoints is not None:
-            return self.found.given(np.asarray(keypoints, float), image)
+            return self.found.given(np.asarray(keypoints, float), timestamp, image)
         if image is None or self.config.detect == "none":
             return {}
-        return self.found.find(image)
+        return self.found.find(image, timestamp)
 
     def mask(
         self, people: dict[int, np.ndarray], intrinsics: Intrinsics
@@ -83,6 +84,17 @@ class LiveBodies:
                 continue
             points = people.get(person, np.zeros((25, 3)))
             body = one.update(timestamp, points, shapes.get(person, _MEAN_BETAS))
+            if body is not None:
+                found[person] = body.T_CH, body.body_pose
+        return found
+
+    def predict(self, timestamp: float) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """Returns T_CH and θ, in a frame in which nobody was looked for, of the people
+        who were visible within the last half second."""
+        found = {}
+        for person, one in self.filters.items():
+            recent = timestamp - self.last_seen[person] <= _MAX_UNSEEN_S
+            body = one.predicted(timestamp) if recent else None
             if body is not None:
                 found[person] = body.T_CH, body.body_pose
         return found

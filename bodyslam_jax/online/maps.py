@@ -46,6 +46,10 @@ _RELOCALISATION_INTERVAL = 3
 """Frames between two attempts to relocalise a lost camera."""
 _MAX_LOST_S = 2.0
 """Time after which a lost camera that sees points begins a new map, s."""
+_MAX_REST_S = 1.0
+"""Longest time that the window rests, s. Once the scale is known it rests as long as
+it took, by the time of the video, which leaves one and a half of two cores to frames.
+"""
 _MAX_WAITING_FRAMES = 10 * CHUNK
 """Largest number of frames that wait for the window when it begins with them. Of more
 frames it takes the newest, and the others keep the cameras that the map located."""
@@ -71,7 +75,8 @@ class _Waiting:
     """A frame with which a map may begin."""
 
     time: float
-    people: dict[int, np.ndarray]
+    people: dict[int, np.ndarray] | None
+    """Keypoints by person; `None` if nobody was looked for."""
     ids: np.ndarray
     uv: np.ndarray
     T_WC: np.ndarray | None = None
@@ -96,12 +101,17 @@ class Maps:
         self.step = self.stride / fps
         self.pool = ThreadPoolExecutor(1) if threads else None
         self.job: Future[tuple[list[Solved], Correction | None]] | None = None
+        self.now = self.submitted = self.rested = -np.inf
+        """Times of the frame that is processed, of that with which the window began,
+        and from which it may begin again, s."""
         self.bodies = LiveBodies(config, body, fps)
         self.counts, self.record = Counts(), Record()
         self.warnings: dict[str, None] = {}
         self.seconds: dict[str, float] = {}
         self.number = -1
         """Number of the current map."""
+        self.origin = 0.0
+        """Time of the first frame, s."""
         self.keeps_points = False
         """True if the points of all frames are recorded, for `smooth`."""
 
@@ -137,7 +147,7 @@ class Maps:
     def _next_map(self) -> None:
         """Counts a new map, and resets what belongs to one."""
         self.number += 1
-        self.slots = Slots(self.step)
+        self.slots = Slots(self.step, self.origin)
         assert self.intrinsics is not None
         self.loops = Loops(self.intrinsics)
         self.lost_since: float | None = None
@@ -179,7 +189,8 @@ class Maps:
         self.map, self.sought = scene, None
         self.warnings.pop(LITTLE_PARALLAX, None)
         for row, pose in zip(rows, poses, strict=True):
-            self._take(row.time, pose, row.ids, row.uv, row.people)
+            row.T_WC = pose
+            self._take(row)
         self.waiting.clear()
 
     def _leave_fixed(
@@ -248,7 +259,7 @@ class Maps:
         )
         self.warnings[self.said] = None
         for row in rows:
-            self._take(row.time, row.T_WC, row.ids, row.uv, row.people)
+            self._take(row)
         return True
 
     # Every frame.
@@ -259,11 +270,15 @@ class Maps:
         gray: np.ndarray | None,
         ids: np.ndarray,
         uv: np.ndarray,
-        people: dict[int, np.ndarray],
+        people: dict[int, np.ndarray] | None,
     ) -> str:
-        """Locates the camera and passes frames to the window; returns the status."""
+        """Locates the camera and passes frames to the window; returns the status.
+
+        `people` is `None` in a frame in which nobody was looked for.
+        """
+        row = _Waiting(timestamp, people, ids, uv)
         if self.sought is not None:
-            self.waiting.append(_Waiting(timestamp, people, ids, uv))
+            self.waiting.append(row)
             poses = self._seek(ids, uv)
             if poses is not None:
                 self._begin_map(poses)
@@ -273,16 +288,14 @@ class Maps:
                     self.fixed_at = timestamp + MAX_START_S
                 if timestamp >= self.fixed_at and self._begin_fixed(timestamp):
                     return "fixed"
-                nowhere = -1, np.eye(4), False
-                self._note_frame(timestamp, *nowhere, people, (ids, uv))
+                self._note_frame(row, -1, np.eye(4))
                 return "starting"
         T_WC = self.map.locate(ids, uv)
         if T_WC is None:
             T_WC = self._find_again(gray)
-        if self.sought is not None:
-            self.waiting[-1].T_WC = T_WC
+        row.T_WC = T_WC
         if T_WC is None:
-            self._take(timestamp, None, ids, uv, people)
+            self._take(row)
             if self.lost_since is None:
                 self.lost_since = timestamp
                 self.counts.lost += 1
@@ -292,7 +305,7 @@ class Maps:
                 return "starting"
             return "lost"
         self.lost_since = None
-        self._take(timestamp, T_WC, ids, uv, people)
+        self._take(row)
         if gray is not None and timestamp - self.last_place >= _KEYFRAME_INTERVAL_S:
             place = self.follower.describe(self.map.points, T_WC)
             if place is not None:
@@ -334,46 +347,32 @@ class Maps:
         self.counts.relocated += 1
         return T_WC
 
-    def _take(
-        self,
-        timestamp: float,
-        T_WC: np.ndarray | None,
-        ids: np.ndarray,
-        uv: np.ndarray,
-        people: dict[int, np.ndarray],
-    ) -> None:
+    def _take(self, row: _Waiting) -> None:
         """Adds a frame to the record, and one at a time of the window to the window."""
-        located = T_WC is not None
-        here = self.map.T_WC if T_WC is None else T_WC
-        measured = Measured(timestamp, here, located, ids, uv, people)
+        located = row.T_WC is not None
+        here = self.map.T_WC if row.T_WC is None else row.T_WC
+        people = row.people or {}
+        measured = Measured(row.time, here, located, row.ids, row.uv, people)
         slot, since, stood = self.slots.take(measured)
         if stood:
             self.warnings[f"no frame came for {stood:.0f} s"] = None
-        self._note_frame(timestamp, slot, since, located, people, (ids, uv))
+        self._note_frame(row, slot, since)
 
-    def _note_frame(
-        self,
-        timestamp: float,
-        slot: int,
-        since: np.ndarray,
-        located: bool,
-        people: dict[int, np.ndarray],
-        points: tuple[np.ndarray, np.ndarray],
-    ) -> None:
+    def _note_frame(self, row: _Waiting, slot: int, since: np.ndarray) -> None:
         number = self.number if slot >= 0 else -1
-        kept = {p: np.asarray(x, np.float32) for p, x in people.items()}
-        seen = Seen(timestamp, number, slot, since, located, kept)
+        kept = {p: np.asarray(x, np.float32) for p, x in (row.people or {}).items()}
+        points = None
         if self.keeps_points:
-            ids, uv = points
-            numbers, pixels = np.array(ids, np.int32), np.array(uv, np.float32)
-            seen = dataclasses.replace(seen, points=(numbers, pixels))
-        self.record.frames.append(seen)
+            points = np.array(row.ids, np.int32), np.array(row.uv, np.float32)
+        located, looked = row.T_WC is not None, row.people is not None
+        given = row.time, number, slot, since, located, kept, points, looked
+        self.record.frames.append(Seen(*given))
 
     # The window.
 
     def _submit(self, flush: bool) -> None:
-        """Passes the waiting frames to the window, if it is idle."""
-        if self.job is not None:
+        """Passes the waiting frames to the window, if it is idle and rested."""
+        if self.job is not None or (self.now < self.rested and not flush):
             return
         if flush:
             self.slots.fill(self.map.T_WC)
@@ -387,6 +386,7 @@ class Maps:
         if not count:
             return
         frames = [measured for _, measured in self.slots.pop(count)]
+        self.submitted = self.now
         if self.pool is not None:
             self.job = self.pool.submit(self._advance, frames)
         else:
@@ -406,6 +406,9 @@ class Maps:
             return
         windows, correction = self.job.result()
         self.job = None
+        if np.isfinite(windows[-1].scale_sigma):
+            took = self.now - self.submitted
+            self.rested = self.now + min(took, _MAX_REST_S)
         unit = self.loops.correction.unit
         if correction is not None:
             self.loops.correction = correction

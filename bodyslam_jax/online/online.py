@@ -70,6 +70,8 @@ class Online(Maps):
         super().__init__(config, body, fps, places, threads)
         self.intrinsics, self.name = intrinsics, name
         self.keeps_points = smooth
+        self.looked: int | None = None
+        """Slot in which people were last looked for."""
         self.notes: list[str] = []
         """Lines of `warn`: they apply to the result of `smooth` too."""
         self.latest: Estimate | None = None
@@ -137,23 +139,30 @@ class Online(Maps):
                 self.latest, status="late", latency=time.perf_counter() - begun
             )
         if not self.started:
-            self._start(image)
+            self._start(image, timestamp)
+        self.now = timestamp
         assert self.intrinsics is not None
         if image is None and points is None:
             raise InputError("update: found neither an image nor points.")
-        people = self.bodies.find(image, keypoints)
+        looks = keypoints is not None or self._is_time_to_look(timestamp)
+        people = self.bodies.find(timestamp, image, keypoints) if looks else None
         gray = None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         if points is None:
             assert gray is not None
-            points = self.follower.advance(
-                gray, self.bodies.mask(people, self.intrinsics)
-            )
+            shown = self.bodies.found.expected(timestamp) if people is None else people
+            mask = self.bodies.mask(shown, self.intrinsics)
+            points = self.follower.advance(gray, mask)
         self._collect(wait=False)
         status = self._locate(timestamp, gray, *points, people)
         shapes = self.record.shapes
-        bodies = self.bodies.follow(timestamp, people, self.intrinsics, shapes)
+        if people is None:
+            bodies = self.bodies.predict(timestamp)
+        else:
+            given = timestamp, people, self.intrinsics, shapes
+            bodies = self.bodies.follow(*given)
         self._submit(flush=False)
         self.counts.frames += 1
+        self.counts.looks += looks
         self.latest = self._estimate(timestamp, status, bodies)
         elapsed = time.perf_counter() - begun
         self.latest = dataclasses.replace(self.latest, latency=elapsed)
@@ -179,6 +188,7 @@ class Online(Maps):
             self.name,
             1 / self.step,
             (*self.warnings, *self.counts.notes()),
+            self.fps,
         )
         if TWO_MAPS in self.warnings:
             measured = dataclasses.replace(measured, contradictions=(TWO_MAPS,))
@@ -216,7 +226,9 @@ class Online(Maps):
         """Returns the sequence with the frames of the file, if there is one."""
         if self.video is None:
             return measured
-        picks = np.array(self.picks, int)
+        used = np.array([frame.time for frame in self.record.frames])
+        at = measured.timestamps + used[0]
+        picks = np.rint(np.interp(at, used, self.picks)).astype(int)
         return dataclasses.replace(measured, frames=self.video, picks=picks)
 
     def warn(self, note: str) -> None:
@@ -245,12 +257,19 @@ class Online(Maps):
 
     # Parts of a frame.
 
-    def _start(self, image: np.ndarray | None) -> None:
+    def _is_time_to_look(self, timestamp: float) -> bool:
+        """Returns whether the networks look for people in this frame: in the first one
+        of each slot of the window, which is the one that the window gets."""
+        before, self.looked = self.looked, self.slots.number(timestamp)
+        return before != self.looked
+
+    def _start(self, image: np.ndarray | None, timestamp: float) -> None:
         if self.intrinsics is None:
             if image is None:
                 raise InputError("intrinsics: found none, nor an image to guess from.")
             self.intrinsics = self._guess(image.shape[1], image.shape[0])
         self.prepare()
+        self.origin = timestamp
         self._begin(self.intrinsics)
         self.started = True
 

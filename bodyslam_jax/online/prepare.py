@@ -48,6 +48,7 @@ def compile_all(
     one = PersonFilter(intrinsics, body, fps, config.people_fit)
     one.update(0.0, points, np.zeros(10))
     one.update(1 / fps, points, np.zeros(10))
+    one.predicted(2 / fps)
     found = one.body()
     placed(0, np.eye(4), found.T_CH, found.body_pose, np.zeros(10), body, None)
     sole_height(body, np.zeros(10))

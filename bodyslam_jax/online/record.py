@@ -7,6 +7,7 @@ it takes half a kilobyte a frame, and one more for each person.
 """
 
 import dataclasses
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -26,6 +27,11 @@ from bodyslam_jax.types import (
     Tracks,
 )
 
+_MAX_FILLED_S = 1.0
+"""Longest gap in which the result has frames that were dropped, s."""
+_MAX_INTERPOLATED_S = 0.35
+"""Longest time between two looks for people in which keypoints are interpolated, s:
+two and a half times that for which their errors persist."""
 _MAX_LANDMARKS = 20_000
 """Largest number of landmarks in the result."""
 
@@ -46,6 +52,10 @@ class Seen:
     people: dict[int, Float[np.ndarray, "25 3"]]
     points: tuple[np.ndarray, np.ndarray] | None = None
     """Numbers and positions (px) of points of the scene, if they are kept."""
+    looked: bool = True
+    """True if people were looked for."""
+    dropped: bool = False
+    """True of a frame that was not used, and is interpolated in the result."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +76,8 @@ class Counts:
 
     frames: int = 0
     """Number of frames that were used."""
+    looks: int = 0
+    """Number of frames in which people were looked for."""
     late: int = 0
     """Number of frames whose time is not after that of the one before."""
     lost: int = 0
@@ -170,7 +182,7 @@ class Record:
             frames=None,
             timestamps=times - times[0],
             intrinsics=intrinsics,
-            keypoints=_keypoints(self, persons),
+            keypoints=_keypoints(self.frames, persons),
             tracks=_tracks(self),
             warnings=warnings,
         )
@@ -218,18 +230,32 @@ def parts_of(
     name: str,
     fps: float,
     warnings: tuple[str, ...],
+    rate: float,
 ) -> tuple[Sequence, SfmResult, JointEstimate]:
     """Returns all frames as the stages of an offline run pass them on: measurements,
-    cameras, and the joint estimate; `fps` is the rate of the window's frames."""
+    cameras, and the joint estimate.
+
+    Where frames were left out, the result has frames at even times (`evenly`): what
+    judges it takes differences of consecutive frames.
+
+    **Arguments:** `fps`: rate of the window's frames, 1/s; `rate`: that of the source.
+    """
     path = _path(record, fps)
+    frames, kept = evenly(record, rate)
     moving = [number for number in record.scales if number not in record.fixed]
     told = record.scales[max(moving)] if moving else []
     _, scales, sigma = smoothed_scales(told, fps)
     scale = float(scales[-1])
-    T_WC, located = _cameras(record, path)
+    T_WC, located = _cameras(frames, record, path)
     persons = sorted({p for slot in record.slots.values() for p in slot.people})
-    roots, poses, present, contacts = _people(record, path, persons, T_WC)
-    cameras = T_WC.copy()
+    roots, poses, present, contacts = (
+        x[:, kept] for x in _people(frames, record, path, persons, T_WC)
+    )
+    points = _keypoints(frames, persons)
+    if points is not None:
+        points = Keypoints(points.uv[:, kept], points.confidence[:, kept])
+    times = np.array([frame.time for frame in frames])[kept]
+    cameras, located = T_WC[kept], located[kept]
     cameras[:, :3, 3] /= scale
     landmarks = np.array(
         [
@@ -241,9 +267,9 @@ def parts_of(
     measured = Sequence(
         name=name,
         frames=None,
-        timestamps=np.array([f.time for f in record.frames]) - record.frames[0].time,
+        timestamps=times - times[0],
         intrinsics=intrinsics,
-        keypoints=_keypoints(record, persons),
+        keypoints=points,
         warnings=warnings,
     )
     none = np.zeros(0, int)
@@ -325,23 +351,64 @@ def _path(record: Record, fps: float) -> _Path:
     return _Path(poses, scale_at)
 
 
+def evenly(record: Record, rate: float) -> tuple[list[Seen], Bool[np.ndarray, " t"]]:
+    """Returns the frames, with those that were dropped and that the result has all the
+    same, and which of them all the result has.
+
+    These are all that were used if they have even times; else one in so many of the
+    source's frames as were used on average, but none in a gap of more than a second.
+    """
+    used = record.frames
+    times = np.array([frame.time for frame in used])
+    gaps = np.diff(times) * rate
+    step = max(1, round(float(np.median(gaps)))) if len(gaps) else 1
+    if not len(gaps) or np.abs(gaps - step).max() < 0.5:
+        return used, np.ones(len(used), bool)
+    short = gaps[gaps <= _MAX_FILLED_S * rate]
+    step = max(1, round(float(short.mean()))) if len(short) else step
+    number = np.rint((times - times[0]) * rate).astype(int)
+    frames, kept = [], []
+    for k, frame in enumerate(used):
+        frames.append(frame)
+        kept.append(number[k] % step == 0 or k == 0)
+        last = k + 1 == len(used)
+        if last or times[k + 1] - times[k] > _MAX_FILLED_S:
+            continue
+        for n in range(number[k] + 1, number[k + 1]):
+            if n % step:
+                continue
+            time, slot = times[0] + n / rate, frame.slot
+            later = lambda slot: record.slots.get((frame.map, slot + 1))
+            while (there := later(slot)) is not None and there.time <= time:
+                slot += 1
+            none = np.eye(4), False, {}, None, False, True
+            frames.append(Seen(time, frame.map, slot, *none))
+            kept.append(True)
+    return frames, np.array(kept, bool)
+
+
 def _cameras(
-    record: Record, path: _Path
+    frames: list[Seen], record: Record, path: _Path
 ) -> tuple[Float[np.ndarray, "t 4 4"], Bool[np.ndarray, " t"]]:
-    """Returns T_WC of every frame, m, and which were located."""
-    T_WC = np.tile(np.eye(4), (len(record.frames), 1, 1))
-    located = np.zeros(len(record.frames), bool)
-    for t, frame in enumerate(record.frames):
+    """Returns T_WC of every frame, m, and which were located, or are between two that
+    were."""
+    T_WC = np.tile(np.eye(4), (len(frames), 1, 1))
+    located = np.zeros(len(frames), bool)
+    for t, frame in enumerate(frames):
         at = path.T_WC.get((frame.map, frame.slot))
-        if at is None:
+        if at is None or frame.dropped:
             continue
         since = frame.since.copy()
         since[:3, 3] *= path.scale[frame.map, frame.slot]
         T_WC[t] = at @ since
         located[t] = frame.located and record.slots[frame.map, frame.slot].located
     if located.any():
-        rows = np.arange(len(T_WC))
-        T_WC = between(rows[located], T_WC[located], rows)
+        times = np.array([frame.time for frame in frames])
+        T_WC = between(times[located], T_WC[located], times)
+    for t, frame in enumerate(frames):  # A dropped frame follows another frame.
+        located[t] |= frame.dropped and located[t - 1]
+    for t in range(len(frames) - 2, -1, -1):
+        located[t] &= not frames[t].dropped or located[t + 1]
     return T_WC, located
 
 
@@ -355,13 +422,25 @@ def _placed(
     return path.T_WC[key][:3, :3] @ p_C + path.T_WC[key][:3, 3]
 
 
-def _keypoints(record: Record, persons: list[int]) -> Keypoints | None:
+def _keypoints(frames: list[Seen], persons: list[int]) -> Keypoints | None:
+    """Returns the keypoints of all frames, interpolated where people were not looked
+    for: errors of keypoints persist for longer, so that this adds no information."""
     if not persons:
         return None
-    found = np.zeros((len(persons), len(record.frames), 25, 3))
-    for t, frame in enumerate(record.frames):
+    found = np.zeros((len(persons), len(frames), 25, 3))
+    for t, frame in enumerate(frames):
         for h, person in enumerate(persons):
             found[h, t] = frame.people.get(person, 0.0)
+    looked = [t for t, frame in enumerate(frames) if frame.looked]
+    for a, b in pairwise(looked):
+        duration = frames[b].time - frames[a].time
+        if b == a + 1 or duration > _MAX_INTERPOLATED_S:
+            continue
+        both = np.minimum(found[:, a, :, 2:], found[:, b, :, 2:]) > 0
+        for t in range(a + 1, b):
+            share = (frames[t].time - frames[a].time) / duration
+            mean = (1 - share) * found[:, a] + share * found[:, b]
+            found[:, t] = np.where(both, mean, 0.0)
     return Keypoints(found[..., :2], found[..., 2])
 
 
@@ -381,7 +460,11 @@ def _tracks(record: Record) -> Tracks | None:
 
 
 def _people(
-    record: Record, path: _Path, persons: list[int], T_WC: Float[np.ndarray, "t 4 4"]
+    frames: list[Seen],
+    record: Record,
+    path: _Path,
+    persons: list[int],
+    T_WC: Float[np.ndarray, "t 4 4"],
 ) -> tuple[
     Float[np.ndarray, "h t 4 4"],
     Float[np.ndarray, "h t 23 3"],
@@ -390,11 +473,11 @@ def _people(
 ]:
     """Returns roots, postures, presence and contacts in every frame, interpolated
     between the frames of the windows."""
-    shape = len(persons), len(record.frames)
+    shape = len(persons), len(frames)
     roots = np.tile(np.eye(4), (*shape, 1, 1))
     poses, present = np.zeros((*shape, 23, 3)), np.zeros(shape, bool)
     contacts = np.zeros((*shape, 4))
-    for t, frame in enumerate(record.frames):
+    for t, frame in enumerate(frames):
         pair = [(frame.map, frame.slot), (frame.map, frame.slot + 1)]
         a, b = (record.slots.get(key) for key in pair)
         if a is None:

@@ -1,11 +1,12 @@
 """Frames at the rate of the window, and the queue of those that wait for it.
 
 The window has a frame every `step` seconds, a *slot*. It contains the frame of the
-video that is nearest in time; others lie between slots. A slot without a frame is
-empty, and its camera is interpolated if the gap is short.
+video that comes first within half a step of it; others lie between slots. A slot
+without a frame is empty, and its camera is interpolated if the gap is short.
 """
 
 import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Float
@@ -13,6 +14,8 @@ from jaxtyping import Float
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.online.window_content import FRAMES, Measured, between
 
+_ROUNDING = 1e-3
+"""Share of a step within which a frame is halfway between two slots."""
 _MAX_GAP_SLOTS = 2
 """Longest gap whose slots count as located, in slots."""
 
@@ -20,14 +23,16 @@ _MAX_GAP_SLOTS = 2
 class Slots:
     """The slots of one map."""
 
-    def __init__(self, step: float) -> None:
-        """**Arguments:** `step`: time between slots, s."""
-        self.step = step
+    def __init__(self, step: float, origin: float = 0.0) -> None:
+        """**Arguments:** `step`: time between slots, s; `origin`: time of a slot, s,
+        the same for all maps."""
+        self.step, self.origin = step, origin
         self.waiting: list[tuple[int, Measured]] = []
         self.front: dict[int, Float[np.ndarray, "4 4"]] = {}
         """First poses of slots that the window has not left, in the map as it is now.
         """
-        self.next, self.first_time = 0, 0.0
+        self.next = self.first = 0
+        """Number of the next slot; and of the map's first one by the clock."""
 
     def take(self, frame: Measured) -> tuple[int, Float[np.ndarray, "4 4"], float]:
         """Adds the next frame of the video.
@@ -36,12 +41,12 @@ class Slots:
         the slot (map units), and the duration of a long gap before it, else 0 (s).
         """
         if self.next == 0:
-            self.first_time = frame.time
-        slot = round((frame.time - self.first_time) / self.step)
+            self.first = self.number(frame.time)
+        slot = self.number(frame.time) - self.first
         gap, stood = slot - self.next, 0.0
         if gap > 2 * FRAMES:  # The source stood still: time goes on from here.
             stood = gap * self.step
-            self.first_time += (gap - FRAMES) * self.step
+            self.first += gap - FRAMES
             slot -= gap - FRAMES
         if 0 < slot - self.next <= _MAX_GAP_SLOTS and frame.located:
             # Frames that the source, or a slow machine, left out.
@@ -57,6 +62,11 @@ class Slots:
             self._put(frame)
         last = self.next - 1
         return last, np.linalg.inv(self.front[last]) @ frame.T_WC, stood
+
+    def number(self, time: float) -> int:
+        """Returns the number of the slot that is nearest to a time (s), counted from
+        the origin; a frame halfway between two is of the earlier one."""
+        return math.floor((time - self.origin) / self.step + 0.5 - _ROUNDING)
 
     def fill(self, T_WC: Float[np.ndarray, "4 4"]) -> None:
         """Adds empty slots, up to whole chunks."""
@@ -84,7 +94,7 @@ class Slots:
     def _empty(self, T_WC: Float[np.ndarray, "4 4"]) -> Measured:
         """Returns the next slot without a frame."""
         none = np.zeros(0, int), np.zeros((0, 2))
-        at = self.first_time + self.next * self.step
+        at = self.origin + (self.first + self.next) * self.step
         return Measured(at, T_WC, False, *none, {})
 
     def _put(self, measured: Measured) -> None:

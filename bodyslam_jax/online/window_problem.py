@@ -149,15 +149,20 @@ def make(
         steps, state.shapes, window.body, weights, shared_error=0.0
     )
     moved, told = _steps_once(window, moved, measured)
-    ground, state = _ground(window, sequence, state, roots, legs, steps, measured)
+    ground, state, begun = _ground(
+        window, sequence, state, roots, legs, steps, measured
+    )
+    metric = np.isfinite(window.scale_sigma) or (begun and bool((told > 0).any()))
+    if window.fixed:  # s is proportional to the floor's height.
+        metric = bool(np.isfinite(np.asarray(ground.sigma)).any())
+    elif not metric:  # s is held, and its value means nothing.
+        moved = eqx.tree_at(lambda f: f.whitening, moved, 0.0 * moved.whitening)
+        ground = _no_ground(window)
     factors = [*of_people, moved, ground]
     factors = [cameras, *(in_frames(f, measured) for f in factors)]
     if window.prior is None:
         nothing = priors.no_prior(state, PRIOR, 2)
         window.prior = priors.with_scale(nothing, window.scale_sigma)
-    metric = np.isfinite(window.scale_sigma) or bool((told > 0).any())
-    if window.fixed:  # s is proportional to the floor's height.
-        metric = bool(np.isfinite(np.asarray(ground.sigma)).any())
     free = dataclasses.replace(state, landmarks=put(places[:0])).zero_step()
     ones = lambda x, mask: jnp.ones_like(x) * jnp.asarray(mask, x.dtype)
     past = np.asarray(np.arange(FRAMES) >= CHUNK - window.prior.reach)
@@ -292,20 +297,14 @@ def _ground(
     legs: np.ndarray,
     steps: Prediction,
     measured: np.ndarray,
-) -> tuple[graph.GroundContact, graph.State]:
-    """Returns the factor of people on the ground of the map, and the state, with a
-    first scale if it has none yet and a cue determines it."""
+) -> tuple[graph.GroundContact, graph.State, bool]:
+    """Returns the factor of people on the ground of the map, the state, with a first
+    scale if it has none yet and enough steps determine it, and whether that is so."""
     weights = window.config.weights
-    blank = graph.GroundContact(
-        window.body,
-        jnp.asarray([0.0, -1.0, 0.0]),
-        jnp.zeros((window.places, FRAMES)),
-        jnp.full((window.places, FRAMES), jnp.inf),
-        jnp.zeros((window.places, FRAMES)),
-    )
+    blank, begun = _no_ground(window), False
     present = roots.present & window.located & legs & measured
     if window.fixed:
-        return _floor(window, sequence, state, present) or blank, state
+        return _floor(window, sequence, state, present) or blank, state, begun
     contact = None
     if present.sum() >= CHUNK:
         contact = initialisation.ground_contact(
@@ -321,9 +320,9 @@ def _ground(
             )
         if np.isfinite(start.standard_error) and start.value > 0:
             scale = jnp.asarray(start.value, state.scale.dtype)
-            state = eqx.tree_at(lambda s: s.scale, state, scale)
+            state, begun = eqx.tree_at(lambda s: s.scale, state, scale), True
     if contact is None:
-        return blank, state
+        return blank, state, begun
     sigma = np.asarray(contact.sigma)
     used = np.isfinite(sigma)
     count, told = float(used.sum()), window.ground_told
@@ -331,7 +330,18 @@ def _ground(
     grown = max(share(told + count) - share(told), 1e-9)
     # `sigma` is that of all frames together times the root of their number.
     sigma = sigma / np.sqrt(count) * np.sqrt(count / grown)
-    return eqx.tree_at(lambda f: f.sigma, contact, jnp.asarray(sigma)), state
+    return eqx.tree_at(lambda f: f.sigma, contact, jnp.asarray(sigma)), state, begun
+
+
+def _no_ground(window: Content) -> graph.GroundContact:
+    """Returns a factor of the ground that says nothing."""
+    return graph.GroundContact(
+        window.body,
+        jnp.asarray([0.0, -1.0, 0.0]),
+        jnp.zeros((window.places, FRAMES)),
+        jnp.full((window.places, FRAMES), jnp.inf),
+        jnp.zeros((window.places, FRAMES)),
+    )
 
 
 def _floor(

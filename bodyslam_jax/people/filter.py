@@ -119,6 +119,15 @@ class PersonFilter:
             self.recent.popleft()
         return self._step(time, uv, sigma, shape)
 
+    def predicted(self, time: float) -> Body | None:
+        """Returns the body at a `time` (s) after the last frame, whose keypoints nobody
+        looked for; `None` before the first frame. The belief stays as it is."""
+        if self.belief is None:
+            return None
+        gap = jnp.asarray(max(time - self.time, 0.0), self.scene.intrinsics.dtype)
+        fps = jnp.asarray(self.fps, gap.dtype)
+        return _as_body(*_ahead(self.scene, self.belief, gap, fps))
+
     def anchor(self, time: float, body: Body, shape: Float[np.ndarray, " 10"]) -> None:
         """Begins again at an earlier time, with a body that a window has solved, and
         filters the keypoints since then once more, at the lifting network's rate."""
@@ -199,10 +208,8 @@ class PersonFilter:
         """
         if self.belief is None:
             raise ValueError("belief: none before the first frame.")
-        fit, T = self.belief.fit, np.eye(4)
-        T[:3, :3], T[:3, 3] = np.asarray(fit.orientation), np.asarray(fit.position)
-        pose = np.asarray(_decode(self.scene, fit.latent), float)
-        return Body(T, pose)
+        fit = self.belief.fit
+        return _as_body(fit, _decode(self.scene, fit.latent))
 
     def _measured(
         self, points: Float[np.ndarray, "25 3"]
@@ -222,6 +229,12 @@ class PersonFilter:
         return uv, sigma
 
 
+def _as_body(fit: Fit, pose: Float[Array, "23 3"]) -> Body:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.asarray(fit.orientation), np.asarray(fit.position)
+    return Body(T, np.asarray(pose, float))
+
+
 def _blank(scene: Scene) -> Belief:
     k = scene.prior.basis.shape[1]
     dtype = scene.intrinsics.dtype
@@ -236,6 +249,14 @@ def _blank(scene: Scene) -> Belief:
 @eqx.filter_jit
 def _decode(scene: Scene, latent: Float[Array, " k"]) -> Float[Array, "23 3"]:
     return scene.prior.decode(latent)
+
+
+@eqx.filter_jit
+def _ahead(
+    scene: Scene, belief: Belief, gap: Float[Array, ""], fps: Float[Array, ""]
+) -> tuple[Fit, Float[Array, "23 3"]]:
+    fit, _ = _predicted(scene, belief, gap, fps)
+    return fit, scene.prior.decode(fit.latent)
 
 
 @eqx.filter_jit

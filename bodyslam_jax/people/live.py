@@ -4,6 +4,9 @@ The networks that ship search a square around each tracked person, and every thi
 second the whole image for a new one. Given keypoints are tracked in the same way. A
 track of some duration is a person; one that begins where a person with the same clothes
 was lost is that person again. Descriptions of clothes are kept in memory only.
+
+Frames are numbered by their times, so that durations and velocities are right where a
+slow machine left frames out.
 """
 
 import dataclasses
@@ -71,7 +74,10 @@ class LivePeople:
         self.fps, self.settings = fps, settings
         self.tracker = Tracker(fps, association.max_gap, MOVENET_POINTS)
         self.persons: dict[int, _Person] = {}
-        self.frame, self.next_search = 0, 0
+        self.start: float | None = None
+        """Time of the first frame, s."""
+        self.frame, self.next_search = -1, 0
+        """Numbers of the last frame, and of the next one that is searched whole."""
         self.networks: tuple | None = None
 
     def load_networks(self) -> None:
@@ -83,12 +89,13 @@ class LivePeople:
             self.networks = open_network(MOVENET), open_network(BLAZEPOSE)
 
     def find(
-        self, image: UInt8[np.ndarray, "y x 3"]
+        self, image: UInt8[np.ndarray, "y x 3"], time: float
     ) -> dict[int, Float[np.ndarray, "25 3"]]:
-        """Returns BODY_25 keypoints (u px, v px, confidence) in the next image, by
-        person."""
+        """Returns BODY_25 keypoints (u px, v px, confidence) in the next image, of
+        `time` (s), by person."""
         self.load_networks()
         assert self.networks is not None
+        self.frame = max(self.frame + 1, self._number(time))
         alive = self.tracker.alive(self.frame)
         expected = [t.expected(self.frame) for t in alive]
         squares = regions(expected, self.settings.min_height, _MAX_PEOPLE)
@@ -110,9 +117,12 @@ class LivePeople:
     def given(
         self,
         keypoints: Float[np.ndarray, "p 25 3"],
+        time: float,
         image: UInt8[np.ndarray, "y x 3"] | None = None,
     ) -> dict[int, Float[np.ndarray, "25 3"]]:
-        """Returns keypoints of the next frame, given in any order, by person."""
+        """Returns keypoints of the next frame, of `time` (s), given in any order, by
+        person."""
+        self.frame = max(self.frame + 1, self._number(time))
         points = keypoints[:, _BODY25_OF_COCO]
         some = np.array([sure_points(p).sum() >= 3 for p in points], bool)
         rows = np.flatnonzero(some)
@@ -123,6 +133,23 @@ class LivePeople:
         every = np.ones(len(rows), bool)
         who = self._track(points[rows], looks, every, every)
         return {person: keypoints[rows[row]] for row, person in who.items()}
+
+    def expected(self, time: float) -> dict[int, Float[np.ndarray, "25 3"]]:
+        """Returns predicted keypoints without feet at a later `time` (s), by person,
+        of everybody whose track is alive."""
+        frame = self._number(time)
+        alive = {t.number: t for t in self.tracker.alive(frame)}
+        return {
+            person: as_body25(alive[known.track].expected(frame), None)
+            for person, known in self.persons.items()
+            if known.track in alive
+        }
+
+    def _number(self, time: float) -> int:
+        """Returns the number of the frame at a time."""
+        if self.start is None:
+            self.start = time
+        return round((time - self.start) * self.fps)
 
     def _look(
         self, image: np.ndarray, region: movenet.Region, longer: int
@@ -152,7 +179,6 @@ class LivePeople:
         for track in self.tracker.tracklets:
             for kept in (track.frames, track.points, track.looks):
                 del kept[:-_MAX_DETECTIONS]
-        self.frame += 1
         found = {}
         for row, number in enumerate(who.tolist()):
             person = None if number < 0 else self._person(number)
@@ -166,7 +192,8 @@ class LivePeople:
                 known.look = self.tracker.tracklets[number].look
                 return person
         track = self.tracker.tracklets[number]
-        if len(track.frames) < max(2, round(MIN_TRACK_S * self.fps)):
+        duration = track.frames[-1] - track.frames[0] + 1
+        if len(track.frames) < 2 or duration < round(MIN_TRACK_S * self.fps):
             return None
         look, person = track.look, len(self.persons)
         away = [
