@@ -32,7 +32,8 @@ MILLIMETRES = ("c_ate_se3", "h_ate_se3", "h_ate_sim3", "j_ate_se3", "pa_mpjpe")
 def make_case(name: str, frames: int, keypoints: bool) -> Case:
     """`simulate_case`, with or without regressed bodies."""
     sequence, family = name.split("-")
-    body, config = load_body_model(), Config(uncertainty=False)
+    body = load_body_model()
+    config = Config(uncertainty=False).for_simulated_people()
     settings = Simulation(sequence=sequence, family=family, length=frames)  # pyright: ignore
     simulated = simulation.simulate(settings, body)
     measured = simulation.as_sequence(simulated)

@@ -49,7 +49,7 @@ FLOORS: dict[str, Height] = {
 def make_case(name: str, floor: str, frames: int) -> Case:
     """`simulate_case` on another floor."""
     sequence, family = name.split("-")
-    body, config = load_body_model(), Config()
+    body, config = load_body_model(), Config().for_simulated_people()
     settings = Simulation(sequence=sequence, family=family, length=frames)  # pyright: ignore
     flat = simulation.simulate(settings, body)
     height = FLOORS[floor]

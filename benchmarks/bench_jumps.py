@@ -71,7 +71,7 @@ def figures(
     simulated: sequences.SimulatedSequence, which: str, static: bool
 ) -> dict[str, Any]:
     """Errors of the result: scale and its claimed error in %, mm, m/s."""
-    config = Config(static_camera=static, overlay=False)
+    config = Config(static_camera=static, overlay=False).for_simulated_people()
     sequence = simulation.as_sequence(simulated)
     if which == "keypoints":
         sequence = dataclasses.replace(sequence, bodies=None)

@@ -29,7 +29,7 @@ import numpy as np
 
 import bodyslam_jax as bs
 from bodyslam_jax import evaluation, io, simulation
-from bodyslam_jax.config import Simulation
+from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.io.sequence import select_frames
 from bodyslam_jax.online import Estimate, Online
 from bodyslam_jax.simulation.exact_scene import look_at
@@ -60,6 +60,7 @@ TAKEN = (
 """Frames of 300 that `bodyslam live` took on two cores."""
 LATE = (7.3, 1.5)
 """s that the first window took then, and about what the others do."""
+CONFIG = Config().for_simulated_people()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -281,6 +282,7 @@ def frames_of(sequence: Sequence) -> Iterator[Given]:
 def prepared(sequence: Sequence, fps: float | None = None) -> Online:
     """An estimate of the sequence's camera, with all programs compiled."""
     online = Online(
+        CONFIG,
         intrinsics=sequence.intrinsics,
         fps=fps or sequence.fps,
         threads=False,
@@ -330,7 +332,7 @@ def compared(
     yield {"estimate": "finish", **errors(result, truth, body), **told}
     if offline:
         begun = time.process_time()
-        whole = bs.run(sequence)
+        whole = bs.run(sequence, CONFIG)
         seconds = round(time.process_time() - begun, 1)
         row = {"estimate": "offline", **errors(whole, truth, body)}
         yield {**row, "status": whole.summary["status"], "processor s": seconds}

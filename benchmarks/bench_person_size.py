@@ -28,7 +28,7 @@ from bodyslam_jax import (
     simulation,
     solver,
 )
-from bodyslam_jax.config import Config, GraphWeights, PeopleFit, Simulation
+from bodyslam_jax.config import Config, GraphWeights, Simulation
 from bodyslam_jax.pipeline.joint_problem import solve_stage
 
 MUTED = graph.RootSmoothness
@@ -50,9 +50,9 @@ def draw(number, frames, family):
 def errors(simulated, weights):
     """Of the leg, as a share: the regressor's (its shrinkage undone), the estimate's,
     and the standard deviation that the covariance says."""
-    body, config = body_.load_body_model(), Config()
+    body, config = body_.load_body_model(), Config().for_simulated_people()
     sequence = diagnostics.reconcile(simulation.as_sequence(simulated), body)
-    bodies = people.estimate_bodies(sequence, body, PeopleFit())
+    bodies = people.estimate_bodies(sequence, body, config.people_fit)
     roots = people.roots_from_bodies(bodies, body)
     state = initialisation.first_state(
         np.array(simulated.T_WC), np.zeros((0, 3)), roots, sequence.intrinsics.params

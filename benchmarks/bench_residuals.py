@@ -124,9 +124,11 @@ def tell(name: str, found: list[dict]) -> None:
         )
 
 
-def estimated(sequence: Sequence, cache: pipeline.Cache) -> list[dict]:
-    sequence = pipeline.find_people(sequence, CONFIG, cache)
-    result, _, used = run_stages(sequence, CONFIG, cache)
+def estimated(
+    sequence: Sequence, cache: pipeline.Cache, config: Config = CONFIG
+) -> list[dict]:
+    sequence = pipeline.find_people(sequence, config, cache)
+    result, _, used = run_stages(sequence, config, cache)
     return list(residuals(used, result))
 
 
@@ -158,7 +160,8 @@ def main() -> None:
         scene = simulation.simulate(filmed(settings))
         folder = (stages or Path("residuals_kept")) / f"{name}-{options.motion}"
         film = simulation.film_scene(folder / "film", scene)
-        rows += estimated(io.read_sequence(film), pipeline.Cache(folder))
+        unseen = CONFIG.for_simulated_people()
+        rows += estimated(io.read_sequence(film), pipeline.Cache(folder), unseen)
     if rows:
         tell(" ".join(options.rendered), rows)
 

@@ -28,7 +28,7 @@ from bodyslam_jax.simulation.room import furnish
 from bodyslam_jax.types import Result, Sequence
 
 UP = np.array([0.0, 1.0, 0.0])
-CONFIG = Config(static_camera=True, overlay=False)
+CONFIG = Config(static_camera=True, overlay=False).for_simulated_people()
 
 
 def static_scene(

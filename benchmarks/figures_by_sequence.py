@@ -199,7 +199,7 @@ def tens(
     from bodyslam_jax.experiments import video
     from bodyslam_jax.experiments.scenario import simulations
 
-    config = Config(overlay=False)
+    config = Config(overlay=False).for_simulated_people()
     experiment = Experiment(
         frames=options.frames, family="both", seed=options.seed, motion=motion
     )

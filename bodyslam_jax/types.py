@@ -390,6 +390,9 @@ class JointEstimate:
     own_variables: tuple[OwnVariable, ...] = ()
     own_factors: tuple[OwnFactor, ...] = ()
     """Terms that a user added (`run(..., factors=, variables=)`)."""
+    root_covariance: Float[np.ndarray, "h t 3 3"] | None = None
+    """Marginal covariance of each pelvis joint in the world, which the first camera
+    fixes, m²; 0 where the person is absent. `None` if it was not computed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -422,6 +425,11 @@ class Result:
     joint_sigma: Float[np.ndarray, "h t 24"] | None = None
     """Expected error (RMS distance) of each joint within the body, m, larger for limbs
     that were hidden; 0 where the person is absent. `None` for a truth."""
+    root_sigma: Float[np.ndarray, "h t 3"] | None = None
+    """Standard deviation of each coordinate of the pelvis joint in W, m: of x and z
+    relative to the first camera and its heading, of y relative to the floor; 0 where
+    the person is absent. `None` for a truth, and where it was not computed or nothing
+    determines the scale."""
 
     @property
     def fps(self) -> float:

@@ -37,7 +37,8 @@ print(sorted(path.name for path in source.iterdir()))
 
 # %%
 sequence = bs.read_sequence(source)
-result = bs.run(sequence, bs.Config(uncertainty=False))
+config = bs.Config(uncertainty=False).for_simulated_people()
+result = bs.run(sequence, config)
 print(*result.summary["headline"], sep="\n")
 
 # %% [markdown]

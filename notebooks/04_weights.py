@@ -132,5 +132,5 @@ Markdown(
 # %% [markdown]
 # A cost cannot say which weight is right: it falls wherever a λ does. Errors against a
 # truth can, and they differentiate through the solver (`jax.grad`, by the implicit
-# function theorem; `docs/toolkit.md`). `bodyslam experiment weights` descends that
-# gradient on several sequences and reports the gain on others.
+# function theorem; `docs/toolkit.md`). What was so learnt on four
+# people did not hold for others (`benchmarks/experiments.md`).

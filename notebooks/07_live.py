@@ -42,7 +42,11 @@ print(f"{sequence.num_frames} frames, {sequence.fps:.0f} a second")
 
 # %%
 online = bs.Online(
-    intrinsics=sequence.intrinsics, fps=sequence.fps, threads=False, name="demo"
+    intrinsics=sequence.intrinsics,
+    fps=sequence.fps,
+    config=bs.Config().for_simulated_people(),
+    threads=False,
+    name="demo",
 )
 online.prepare()
 

@@ -460,6 +460,7 @@ def _run_arrays() -> Any:
         "joints": rng.normal(size=(h, NUM, 24, 3)),
         "present": np.ones((h, NUM), bool),
         "joint_sigma": np.full((h, NUM, 24), 0.02),
+        "root_sigma": np.full((h, NUM, 3), 0.1),
     }
 
 
@@ -479,7 +480,7 @@ def _summary() -> Any:
         "camera_motion": "moving",
         "camera_path_m": 2.5,
         "scale": {"value": 1.5, "sigma": 0.1},
-        "people": [person, person | {"stature_sigma_m": 0.03}],
+        "people": [person, person | {"stature_sigma_m": 0.03, "place_sigma_m": 0.1}],
         "frames_used": [0, NUM - 1],
         "durations_s": {"joint": 3.0, "cameras": 2.0},
         "errors": {"joint estimate, in metres": {"c_ate_se3": 0.05, "h_ate_se3": "no"}},

@@ -196,9 +196,6 @@ def extra_factors(rng, state, seen=None):
             correlation=g.ar1_correlation(there, 0.9),
             correlated=False,
         ),
-        g.RelativeOrientation(
-            rotation=0.05 * normal(h, t, 3), sigma=late(h, t, skip=1)
-        ),
         g.CameraPrior(cameras=state.cameras, sigma=jnp.full((t, 6), 0.3)),
         g.IntrinsicsPrior(
             intrinsics=state.intrinsics[None], sigma=jnp.full((1, i), 20.0)
@@ -232,7 +229,6 @@ def extra_factors(rng, state, seen=None):
             scale=jnp.full((h, t), 1.5),
             sigma=late(h, t, 4, skip=1),
         ),
-        g.UprightPrior(up=jnp.array([0.0, -1, 0]), sigma=jnp.full((h, t), 0.2)),
         g.GroundContact(
             body=body,
             normal=jnp.array([0.1, -0.99, 0.1]),

@@ -6,7 +6,10 @@ import pytest
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import Experiment
 from bodyslam_jax.experiments import calibration
+from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.simulation.posing import Person
+from bodyslam_jax.simulation.room import Box, Room, Terrain
+from bodyslam_jax.types import Result
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +66,9 @@ def test_errors_as_large_as_claimed_have_the_coverage_of_a_normal_distribution(
             "z_joints": None,
             "joints_within_68": None,
             "joints_within_95": None,
+            "z_heights": 0.5 * rng.standard_normal(),
+            "heights_within_68": 0.9,
+            "heights_within_95": 0.99,
         }
         for i in range(2000)
     ]
@@ -81,4 +87,43 @@ def test_errors_as_large_as_claimed_have_the_coverage_of_a_normal_distribution(
         assert one == pytest.approx(0.68, abs=0.03)
         assert two == pytest.approx(0.95, abs=0.02)
     assert cells("stature")[0] == pytest.approx(2, abs=0.1)
+    assert cells("pelvis over the floor (y)")[0] == pytest.approx(0.5, abs=0.05)
+    assert cells("pelvis over the floor (y)")[1:] == [0.9, 0.99]
     assert not any(line.startswith("| joints") for line in lines)
+
+
+@pytest.mark.parametrize("slope", [None, 0.1])
+def test_the_true_world_is_that_of_the_first_camera_and_the_floor(slope):
+    """A camera that looks down, rolled, to the world's -x: W has its heading alone."""
+    t, side = 30, np.array([0.0, 1.0, 0.0])
+    ahead = np.array([-1.0, 0.0, 0.0])
+    down = np.cross(ahead, np.cross(side, ahead))
+    level = np.stack([np.cross(-down, ahead), -down, ahead], axis=1)
+    tilt = so3.exp(np.array([-0.3, 0.0, 0.0])) @ so3.exp(np.array([0.0, 0.0, 0.2]))
+    T_WC = np.eye(4)
+    T_WC[:3, :3], T_WC[:3, 3] = level @ tilt, [5.0, 1.7, 2.0]
+    joints = np.zeros((1, t, 24, 3)) + [2.0, 0.4, 2.5]
+    truth = Result(
+        timestamps=np.arange(t) / 30,
+        T_WC=np.tile(T_WC, (t, 1, 1)),
+        scale=1.0,
+        intrinsics=np.ones(4),
+        landmarks=np.zeros((0, 3)),
+        poses=np.zeros((1, t, 72)),
+        trans=np.zeros((1, t, 3)),
+        betas=np.zeros((1, 10)),
+        joints=joints,
+        present=np.ones((1, t), bool),
+    )
+    box = Box(np.zeros(3), np.ones(3), 0.0)
+    room, floor = Room(box, ()), 0.0
+    if slope is not None:
+        room, floor = Terrain(box, (), lambda at: slope * at[..., 0]), 2 * slope
+    found, eye = calibration.in_world(truth, room)
+    assert eye == pytest.approx(1.7 - floor)
+    # 3 m ahead, half a metre to the camera's left or right, 0.4 m above level 0.
+    np.testing.assert_allclose(found[..., 2], 3.0, atol=1e-9)
+    np.testing.assert_allclose(found[..., 1], 0.4 - floor, atol=1e-9)
+    left = np.cross(np.array([0.0, 1.0, 0.0]), ahead)
+    expected = (joints[0, 0, 0] - T_WC[:3, 3]) @ left
+    np.testing.assert_allclose(found[..., 0], expected, atol=1e-9)

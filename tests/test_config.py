@@ -86,7 +86,7 @@ def test_settings_that_mean_something_are_let_in():
         ),
         (
             "weights: {upright_sigma: 0.1}",
-            "weights: `upright_sigma` no longer exists: pipeline.run(factors=) takes",
+            "weights: `upright_sigma` no longer exists: it changed nothing",
         ),
         ("smoothing_hz: 0.0", "smoothing_hz: found 0.0, expected more than 0"),
         (

@@ -1,8 +1,7 @@
-"""Experiments on small made-up problems: variants, perturbations, weights, rows."""
+"""Experiments on small made-up problems: variants, perturbations, rows."""
 
 import csv
 import dataclasses
-import importlib
 import json
 import math
 import shutil
@@ -27,7 +26,6 @@ from bodyslam_jax.experiments import (
     plans,
     reports,
     tables,
-    weights,
 )
 from bodyslam_jax.experiments.ablation import shake
 from bodyslam_jax.experiments.jobs import Journal, fits
@@ -36,9 +34,7 @@ from bodyslam_jax.experiments.scenario import (
     NAMES,
     PLAUSIBILITY_FIGURES,
     simulations,
-    with_scale,
 )
-from bodyslam_jax.pipeline.case import trajectories
 
 SHORT = (solver.Stage(("scale", "roots"), max_steps=8),)
 """Postures held: compiled in a few seconds."""
@@ -129,91 +125,6 @@ def test_shaking_keeps_what_holds_the_map(scene):
     np.testing.assert_array_equal(shaken.cameras[0], start.cameras[0])
     held = np.asarray(problem.free.cameras[1:, 3:]) == 0
     assert held.any() and not np.asarray(moved)[1:][held].any()
-
-
-def test_weights_scale_residuals_and_missing_stays_missing(scene):
-    problem, _, start = scene
-    names = experiments.names_of(problem)
-    assert set(names) == {
-        "keypoints",
-        "keypoints loss",
-        "human_motion",
-        "body_pose",
-        "shape",
-        "landmarks",
-        "landmarks loss",
-    }
-    log = jnp.log(2.0) * jnp.array(
-        [float(n in ("human_motion", "shape")) for n in names]
-    )
-
-    @jax.jit
-    def costs(log):
-        changed = experiments.reweighted(problem, names, log)
-        return changed.cost_by_term(start, held=True)
-
-    before, after = costs(jnp.zeros(len(names))), costs(log)
-    for name, value in before.items():
-        share = 4.0 if name in ("human_motion", "shape") else 1.0
-        np.testing.assert_allclose(value, share * after[name], rtol=1e-12)
-    slope = jax.jit(jax.grad(lambda log: sum(costs(log).values())))
-    assert np.isfinite(slope(jnp.zeros(len(names)))).all()
-    twice = experiments.reweighted(problem, ("keypoints",), jnp.log(jnp.array([2.0])))
-    old, new = problem.factors[1].sigma, twice.factors[1].sigma
-    assert np.isinf(new)[np.isinf(old)].all()
-    with pytest.raises(ValueError, match="nosuch"):
-        experiments.reweighted(problem, ("nosuch",), jnp.zeros(1))
-
-
-def _steep(calls, last=math.inf):
-    """Stands in for a solve: an error that is least at 1, and how often it was asked.
-
-    The state is a little larger each time, and counts: what was interrupted has to find
-    that again too.
-    """
-
-    def error_and_gradient(trial, names, value, state):
-        calls.append(1)
-        if len(calls) > last:
-            raise KeyboardInterrupt
-        error = ((value - 1.0) ** 2).sum()
-        gradient = 2 * (value - 1.0) + 0.01 * state.scale
-        return error, gradient, with_scale(state, 1.1 * state.scale)
-
-    return error_and_gradient
-
-
-def test_learning_goes_on_after_an_interruption(scene, tmp_path, monkeypatch):
-    problem, truth, start = scene
-    body, there = scenes.body_model(), jnp.ones((1, 12), bool)
-    seen = trajectories(truth, body, there, there[0], jnp.asarray(30.0))
-    trials = [experiments.Trial(problem, start, seen, body, there[0])] * 2
-    names = ("human_motion", "shape")
-    learn = lambda steps, **kw: experiments.learn_weights(
-        trials, steps=steps, names=names, **kw
-    )
-    monkeypatch.setattr(weights, "error_and_gradient", _steep(calls := []))
-    whole = learn(6)
-    assert len(calls) == 12 and (np.diff(whole.history) < 0).all()
-
-    file = tmp_path / "stages" / "progress.npz"
-    monkeypatch.setattr(weights, "error_and_gradient", _steep([], last=7))
-    with pytest.raises(KeyboardInterrupt):
-        learn(6, progress=file)
-    monkeypatch.setattr(weights, "error_and_gradient", _steep(calls := []))
-    rest = learn(6, progress=file)
-    assert len(calls) == 6  # three steps were done
-    np.testing.assert_array_equal(rest.history, whole.history)
-    np.testing.assert_array_equal(rest.path, whole.path)
-    learn(6, progress=file)
-    assert len(calls) == 6
-
-    with pytest.raises(ValueError, match="progress.npz.*motion"):
-        experiments.learn_weights(
-            trials, names=("human_motion", "body_pose"), progress=file
-        )
-    file.write_bytes(b"PK cut short")
-    np.testing.assert_array_equal(learn(6, progress=file).path, whole.path)
 
 
 def test_rows_are_computed_once(tmp_path):
@@ -335,10 +246,10 @@ def test_rows_follow_what_files_hold(tmp_path):
     paths = set()
     for content in (b"one", b"two"):
         file.write_bytes(content)
-        for name in ("table1", "motion", "weights"):
+        for name in ("table1", "motion"):
             for job in PLANS[name](on, config, tmp_path).jobs:
                 paths.add(Journal(tmp_path).path(name, job.label, *job.key))
-    assert len(paths) == 2 * (20 + 1 + 8)
+    assert len(paths) == 2 * (20 + 1)
 
 
 def test_missing_files_are_told_before_anything_is_computed(tmp_path):
@@ -422,9 +333,10 @@ def test_command_takes_finished_rows(tmp_path, monkeypatch, capsys, caplog):
 @pytest.fixture
 def made_up(monkeypatch):
     """Two sequences of `table1`, computed at once: their settings, and which were."""
-    real, computed = PLANS["table1"], []
+    real, computed, lifters = PLANS["table1"], [], []
 
     def plan(*given):
+        lifters.append(given[1].people_fit.lifter)
         found = real(*given)
 
         def compute(job):
@@ -438,7 +350,9 @@ def made_up(monkeypatch):
         return dataclasses.replace(found, jobs=jobs)
 
     monkeypatch.setitem(PLANS, "table1", plan)
-    return Experiment(sequences=("E1", "M2"), family="room", frames=300), computed
+    yield Experiment(sequences=("E1", "M2"), family="room", frames=300), computed
+    # Simulated people are never estimated by a network that has learnt from them.
+    assert set(lifters) == {"held-out"}
 
 
 @pytest.fixture
@@ -488,7 +402,9 @@ def test_tables_say_what_is_not_as_by_default(tmp_path, made_up, monkeypatch):
     named = lambda setting: setting and Path(setting)
     monkeypatch.setattr(reports, "body_model_file", named)
     plain = reports.about(Experiment(), Config())
-    assert plain == "Simulated sequences, noise level `real`."
+    assert plain == (
+        "Simulated sequences, noise level `real`, lifting network `everybody`."
+    )
     weights = dataclasses.replace(Config().weights, pixel_sigma=2.0)
     config = Config(weights=weights, motion_model="m.npz", body_model="b.npz")
     assert reports.about(Experiment(motion="walk.npz"), config) == (
@@ -503,6 +419,7 @@ def test_tables_say_what_is_not_as_by_default(tmp_path, made_up, monkeypatch):
         again = dataclasses.replace(on, seed=seed)
         experiments.run_experiment("table1", tmp_path, again)
         text = (tmp_path / "table1.md").read_text()
+        assert "noise level `real`, lifting network `held-out`." in text
         assert f"Not as by default: seed {seed}; 300 frames each. Ours:" in text
 
 
@@ -521,12 +438,6 @@ def test_file_without_motion_is_refused(tmp_path, name):
     with pytest.raises(ValueError, match="tracks.npz: no motion.*expected.*AMASS"):
         experiments.run_experiment(name, tmp_path / "out", Experiment(motion=str(file)))
     assert not (tmp_path / "out").exists()
-
-
-def test_learning_weights_costs_a_compilation(tmp_path):
-    on = Experiment(sequences=("E1", "M1"), frames=40)
-    learnt, *_ = PLANS["weights"](on, Config(), tmp_path).jobs
-    assert 240 < learnt.seconds < 360
 
 
 def test_axes_of_figures(tmp_path):
@@ -573,20 +484,6 @@ def test_reports_of_made_up_rows(tmp_path):
     assert "| no ground |" + 10 * " – |" + " no such term |" in text
     assert "mean" not in text.split("M2-room")[1]
 
-    names = ["motion", "shape"]
-    row = {"names": names, "log": [0.0, 0.7], "factor": [1.0, 2.0]}
-    row |= {"history": [2.0, 1.5], "path": [[0.0, 0.0], [0.0, 0.7]]}
-    one = {"sequence": "E1-room", "set": "training"}
-    for when in ("before", "after"):
-        one |= {f"{when}/{k}": 0.5 for k in ("error", "scale", "j_ate_se3")}
-    other = {**one, "set": "test", "sequence": "D1-room"}
-    reports.write_weights(tmp_path, [row, one, other], about="Simulated.")
-    text = (tmp_path / "weights.md").read_text()
-    assert "| shape | 2.00 | 0.25 |" in text and "## test sequences" in text
-    # Learnt, and interrupted before any sequence was judged.
-    reports.write_weights(tmp_path, [row], about="Simulated.")
-    assert "| shape | 2.00 | 0.25 |" in (tmp_path / "weights.md").read_text()
-
 
 @pytest.mark.slow
 def test_command_with_a_subset_resumes(tmp_path, monkeypatch, caplog):
@@ -620,10 +517,6 @@ def few(tmp_path, monkeypatch):
     name = "errors of frames independent"
     monkeypatch.setattr(ablation, "SETTINGS", {name: ablation.SETTINGS[name]})
     monkeypatch.setattr(plans, "NOISE_LEVELS", ("low",))
-    monkeypatch.setattr(plans, "LEARNING_STEPS", 3)
-    # The package exports the function of this module's name.
-    solve = importlib.import_module("bodyslam_jax.solver.solve")
-    monkeypatch.setattr(solve, "PAPER_STEPS", (20, 20))
     file = tmp_path / "own.npz"
     shutil.copy(Path(motion.__file__).parent / "assets" / "default.npz", file)
     return str(file)
@@ -634,24 +527,15 @@ def test_every_plan_on_forty_frames(tmp_path, few, caplog):
     """Each row is computed, has all that its report says, and is kept."""
     caplog.set_level("INFO")
 
-    def on(*sequences):
-        return Experiment(
-            sequences=sequences,
-            family="follow",
-            frames=40,
-            noise="low",
-            motion_models=(few,),
-        )
-
-    asked = {
-        "scale": on("M1"),
-        "landmarks": on("E2"),  # one of the paper's
-        "motion": on("M1"),
-        "ablation": on("M1"),
-        "weights": on("M1", "E2"),
-    }
+    settings = Experiment(
+        sequences=("E2",),  # one of the paper's for `landmarks`
+        family="follow",
+        frames=40,
+        noise="low",
+        motion_models=(few,),
+    )
     rows = {}
-    for name, settings in asked.items():
+    for name in ("scale", "landmarks", "motion", "ablation"):
         experiments.run_experiment(name, tmp_path, settings)
         jobs = PLANS[name](settings, Config(), tmp_path / "stages").jobs
         journal = Journal(tmp_path / "rows")
@@ -677,17 +561,6 @@ def test_every_plan_on_forty_frames(tmp_path, few, caplog):
     assert own["past"] == full["past"] == motion.load_motion_model(few).past
     assert own["j_ate_se3"] == pytest.approx(full["j_ate_se3"], rel=1e-3)
     assert full["c_ate_se3"] < 0.01 < ablated["no landmarks"]["c_ate_se3"]
-    first, *others = (ablated[order]["cost"] for order in ablation.ORDERS)
-    assert first == pytest.approx(full["cost"], rel=1e-3) and first < min(others)
     known = {"converged", "no such term"}
-    first_order = lambda name: "order" in name or name == ablation.PUBLISHED
-    solved = [row for name, row in ablated.items() if not first_order(name)]
+    solved = [row for name, row in ablated.items() if name != ablation.PUBLISHED]
     assert {row["status"] for row in solved} <= known
-
-    learnt, trained, tested = rows["weights"]
-    history = learnt["history"]
-    assert len(history) == 3 and history[2] < history[1] < history[0]
-    assert (trained["sequence"], trained["set"]) == ("M1-follow", "training")
-    assert (tested["sequence"], tested["set"]) == ("E2-follow", "test")
-    assert trained["before/error"] == pytest.approx(history[0], rel=1e-3)
-    assert trained["after/error"] < trained["before/error"]

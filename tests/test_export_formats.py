@@ -243,7 +243,9 @@ def test_each_person_has_a_file(tmp_path, result, body):
 def test_csv_holds_joints_angles_and_speeds(tmp_path, result, body):
     sigma = np.full(result.joints.shape[:3], 0.03)
     sigma[0] = 0.5  # somebody else's
-    known = dataclasses.replace(result, joint_sigma=sigma)
+    places = np.ones(result.joints.shape[:2] + (3,)) * [0.1, 0.2, 0.3]
+    places[0] = 0.5
+    known = dataclasses.replace(result, joint_sigma=sigma, root_sigma=places)
     (path,) = export.export(known, tmp_path / "a.csv", body=body, person=1)
     rows = list(csv.DictReader(path.read_text().splitlines()))
     assert len(rows) == len(result.timestamps)
@@ -252,6 +254,13 @@ def test_csv_holds_joints_angles_and_speeds(tmp_path, result, body):
     found = [float(row[f"left_knee_{axis}_m"]) for axis in "xyz"]
     np.testing.assert_allclose(found, result.joints[1, k, 4], rtol=1e-4, atol=1e-6)
     assert float(row["left_knee_sigma_m"]) == 0.03
+    found = [float(row[f"pelvis_place_{axis}_sigma_m"]) for axis in "xyz"]
+    assert found == [0.1, 0.2, 0.3]
+    (path,) = export.export(known, tmp_path / "z.csv", up="z", body=body, person=1)
+    row = list(csv.DictReader(path.read_text().splitlines()))[k]
+    found = [float(row[f"pelvis_place_{axis}_sigma_m"]) for axis in "xyz"]
+    np.testing.assert_allclose(sorted(found), [0.1, 0.2, 0.3], rtol=1e-4)
+    assert found[2] == pytest.approx(0.2)  # the height's
     assert float(row["time_s"]) == pytest.approx(result.timestamps[k], abs=1e-6)
     absent = np.flatnonzero(~result.present[1])
     assert len(absent) and all(rows[k]["pelvis_x_m"] == "" for k in absent)

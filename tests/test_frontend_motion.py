@@ -13,6 +13,7 @@ from bodyslam_jax.io import frames, read_sequence
 from bodyslam_jax.io.video import look_at
 from bodyslam_jax.sfm import incremental, reconstruct, track
 from bodyslam_jax.sfm.bundle import Scene, Views, adjust, errors
+from bodyslam_jax.sfm.camera_motion import rotation_error
 from bodyslam_jax.sfm.features import match, spread
 from bodyslam_jax.sfm.incremental import Builder
 from bodyslam_jax.sfm.multiview import resect
@@ -342,6 +343,35 @@ def test_tolerates_noise_and_outliers():
     tracks, truth = scene("orbit", noise=1.5)
     found = reconstruct(tracks, CAMERA, 60)
     assert camera_error(found.T_WC, truth) < 0.05 and found.inlier.mean() > 0.7
+
+
+@pytest.mark.parametrize("noise, widened", [(0.4, False), (1.5, True)])
+def test_the_tolerance_of_a_map_grows_with_noise_only(noise, widened):
+    """A start may explain little because of short parallax; one that explains more with
+    twice the tolerance, but not by it, must not keep that."""
+
+    class Unlucky(Builder):
+        """The first start misses the points of half of the tracks."""
+
+        def _best_start(self, keyframes, pairs):
+            grown, score = super()._best_start(keyframes, pairs)
+            assert grown is not None
+            if self.threshold == first:
+                grown.has_point[::2] = False
+                grown.inlier &= grown.has_point[self.views.landmark]
+                score /= 2
+            return grown, score
+
+    tracks, _ = scene("orbit", noise=noise)
+    fx, fy, cx, cy = CAMERA.params
+    xy = (tracks.uv - [cx, cy]) / [fx, fy]
+    views = Views(tracks.frame, tracks.landmark, xy)
+    builder = Unlucky(views, 60, int(tracks.landmark.max()) + 1, fx, Structure())
+    first = builder.threshold
+    keyframes = np.arange(0, 60, 3)
+    grown = builder.build(keyframes, rotation_error(views, keyframes, 1 / fx))
+    assert grown is not None and grown.registered[keyframes].all()
+    assert (builder.threshold > first) == widened
 
 
 def test_a_turning_camera_has_no_parallax():

@@ -317,6 +317,33 @@ def test_programs_read_who_can_be_trusted(tmp_path):
     np.testing.assert_array_equal(found.joint_sigma, result.joint_sigma)
 
 
+def test_programs_read_how_far_off_a_place_may_be(tmp_path):
+    sequence, cameras, joint = scene()
+    spread = np.tile(0.04 * np.eye(3), (1, FRAMES, 1, 1))
+    shapes = np.tile(0.1 * np.eye(10), (1, 1, 1))
+    joint = dataclasses.replace(joint, root_covariance=spread, shape_covariance=shapes)
+    body = load_body_model()
+    result = assemble(sequence, Config(), body, cameras, joint, {})
+    export.write_run(tmp_path, result)
+    found = evaluation.read_result(tmp_path)
+    np.testing.assert_array_equal(found.root_sigma, result.root_sigma)
+    person, height = (found.summary[k] for k in ("people", "camera_height"))
+    level = np.linalg.norm(found.root_sigma[0][:, [0, 2]], axis=1)
+    assert (level > np.sqrt(2) * 0.2).all()
+    rms = np.sqrt((level[found.present[0]] ** 2).mean())
+    assert person[0]["place_sigma_m"] == pytest.approx(rms)
+    assert 0 < person[0]["height_sigma_m"] < person[0]["place_sigma_m"]
+    assert height["value_m"] == pytest.approx(found.T_WC[0, 1, 3])
+    assert height["sigma_m"] > 0
+    export.write_report(tmp_path / "report.html", result, body)
+    assert f"± {rms:.2f}" in (tmp_path / "report.html").read_text()
+    # An estimate whose covariance was not computed claims nothing.
+    joint = dataclasses.replace(joint, root_covariance=None)
+    result = assemble(sequence, Config(), body, cameras, joint, {})
+    assert result.root_sigma is None
+    assert result.summary["people"][0]["place_sigma_m"] is None
+
+
 def test_the_report_gives_no_metres_of_who_is_not_measurable(tmp_path):
     sequence, cameras, joint = scene()
     small, joint = smaller(sequence, joint, 6.0)

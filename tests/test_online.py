@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,6 +63,14 @@ def test_a_walk_of_the_scale_adds_variance_to_it_alone():
     covariance[0, 0] += 0.7
     assert np.abs(wider - covariance).max() < 1e-7 * np.abs(covariance).max()
     assert np.abs(after - mean).max() < 1e-6
+
+
+def test_a_prior_of_another_unit_costs_the_same_at_the_scale_in_that_unit():
+    state, prior = random_prior(12, 1, np.random.default_rng(1))
+    state = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(1.7))
+    longer = eqx.tree_at(lambda s: s.scale, state, jnp.asarray(1.7 * 0.9))
+    found = priors.with_drift_of_scale(prior, 0.9).residual(longer)
+    np.testing.assert_allclose(found, prior.residual(state), atol=1e-6)
 
 
 def test_people_who_go_leave_what_they_told_of_the_rest():

@@ -9,12 +9,13 @@ import bodyslam_jax as bs
 from bodyslam_jax import simulation
 from bodyslam_jax.config import Simulation
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.io.camera.calibration import project_points
+from bodyslam_jax.io.camera.calibration import as_opencv, project_points, rays
 from bodyslam_jax.people.filter import PersonFilter
 from bodyslam_jax.people.live import LivePeople
 from bodyslam_jax.sfm import multiview
 from bodyslam_jax.sfm.live_map import LiveMap
 from bodyslam_jax.sfm.live_tracks import PointFollower
+from bodyslam_jax.sfm.places import Place
 from bodyslam_jax.types import Intrinsics
 
 
@@ -158,14 +159,20 @@ def test_a_place_is_recognised_and_a_dark_image_has_no_points():
     follower.ids = np.arange(len(corners))
     follower.uv = np.array([c.pt for c in corners])
     follower.step = np.zeros_like(follower.uv)
-    known = {i: np.append(follower.uv[i], 1.0) for i in follower.ids.tolist()}
-    follower.remember(known)
+    T_WC = np.eye(4)
+    T_WC[:3, 3] = 1.0, 2.0, 3.0
+    xy = rays(follower.uv, *as_opencv(CAMERA.params))
+    p_C = 4.0 * np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    place = follower.describe(dict(enumerate(p_C + T_WC[:3, 3])), T_WC)
+    assert place is not None and place.depth == pytest.approx(4.0)
+    assert follower.describe({}, T_WC) is None
     follower.advance(np.zeros_like(image), None)
     assert len(follower.ids) == 0
-    found = follower.recognise(image)
-    assert found is not None
-    points, uv = found
-    assert np.median(np.linalg.norm(points[:, :2] - uv, axis=1)) < 2.0  # px
+    dark = Place(place.descriptors[:5], place.points[:5])
+    found = follower.recognise(image, [dark, place])
+    assert found is not None and found[0] is place
+    away = project_points(CAMERA, found[1]) - found[2]
+    assert np.median(np.linalg.norm(away, axis=1)) < 2.0  # px
 
 
 # People.

@@ -12,6 +12,7 @@ from bodyslam_jax.body import load_body_model
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.motion import read_motion
 from bodyslam_jax.people import fit, lift, skeleton
+from bodyslam_jax.people.filter import PersonFilter
 from bodyslam_jax.people.posture_prior import load_posture_prior
 from bodyslam_jax.simulation import sensor_noise, sequences
 from bodyslam_jax.types import Intrinsics, Keypoints
@@ -20,6 +21,8 @@ FPS = 30.0
 CAMERA = Intrinsics(np.array([900.0, 900.0, 640.0, 360.0]), 1280, 720)
 SIGMA = np.tile(lift.KEYPOINT_SIGMA, (60, 1))
 ANKLES = [7, 8]
+UNSEEN = PeopleFit(lifter="held-out")
+"""With the network that has not learnt from the people here."""
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +65,7 @@ def pixels(points, intrinsics):
 
 def predict(uv, sigma, intrinsics=CAMERA.params, fps=FPS):
     arrays = (jnp.asarray(a) for a in (intrinsics, uv, sigma, fps))
-    return lift.lift(lift.load_lifter(), *arrays)
+    return lift.lift(lift.load_lifter(lift.HELD_OUT_ASSET), *arrays)
 
 
 def test_a_guess_does_not_depend_on_the_lens_nor_on_where_the_camera_points(walk):
@@ -133,7 +136,7 @@ def test_frames_without_keypoints_have_no_guess_and_spoil_no_other(walk, body):
     np.testing.assert_allclose(found.latent[56:], plain.latent[56:], atol=1e-5)
 
     scene = fit.make_scene(CAMERA, body, FPS, PeopleFit())
-    guess = fit.guess_postures(scene, uv, sigma, FPS)
+    guess = fit.guess_postures(scene, uv, sigma, FPS, UNSEEN)
     assert np.isinf(guess.latent_sigma[missing]).all()
     assert np.isinf(guess.turn_sigma[missing]).all()
     assert np.isfinite(guess.latent_sigma[56:]).all()
@@ -165,7 +168,7 @@ def test_a_guess_says_less_the_longer_its_errors_last(seen, body):
     decode = np.linalg.pinv(prior.basis)[:5]
 
     def away(seconds):
-        settings = PeopleFit(lift_correlation=seconds)
+        settings = PeopleFit(lifter="held-out", lift_correlation=seconds)
         bodies = people.fit_bodies(seen, CAMERA, body, FPS, settings)
         angles = people.roots_from_bodies(bodies, body).body_pose[0, :, :21]
         latent = (angles.reshape(-1, 63) - np.asarray(prior.mean)) @ decode.T
@@ -198,11 +201,11 @@ def test_legs_of_who_walks_away_swing(walk, seen, body):
         away = found - (joints - joints[:, :1])
         return np.linalg.norm(away, axis=-1)[:, [4, 5, 7, 8]].mean()  # m
 
-    found = fit(PeopleFit())
+    found = fit(UNSEEN)
     share = swing(found) @ swing(joints) / (swing(joints) @ swing(joints))
     assert 0.9 < share < 1.1
     assert error(found) < 0.055
-    assert error(fit(PeopleFit(lift_scale=0.0))) > 1.2 * error(found)
+    assert error(fit(PeopleFit(lifter="held-out", lift_scale=0.0))) > 1.2 * error(found)
 
 
 def test_in_single_precision(walk):
@@ -212,7 +215,7 @@ def test_in_single_precision(walk):
         jnp.asarray(a, jnp.float32)
         for a in (CAMERA.params, pixels(points, CAMERA.params), SIGMA, FPS)
     ]
-    other, _ = lift.lift(lift.load_lifter(), *single)
+    other, _ = lift.lift(lift.load_lifter(lift.HELD_OUT_ASSET), *single)
     assert other.latent.dtype == other.orientation.dtype == jnp.float32
     np.testing.assert_allclose(other.latent, found.latent, atol=1e-3)
 
@@ -224,9 +227,30 @@ def test_knees_are_as_measured_and_not_as_those_of_most_people(body):
         poses[:, joint, 0] += np.radians(15.0) * turn
     _, _, points = seen_from_behind(poses, body)
     keypoints = Keypoints(pixels(points, CAMERA.params)[None], np.ones((1, 60, 25)))
-    found = people.fit_bodies(keypoints, CAMERA, body, FPS).poses[0]
+    found = people.fit_bodies(keypoints, CAMERA, body, FPS, UNSEEN).poses[0]
     straighter = lambda poses: np.degrees(
         np.linalg.norm(poses.reshape(-1, 24, 3)[:, [4, 5]], axis=-1).min(axis=1).mean()
     )
     # Seen from behind the guess takes 6 degrees of it; a mean of gait would take 10.
     assert abs(straighter(found) - straighter(poses)) < 8.0
+
+
+@pytest.mark.parametrize("which", ["everybody", "held-out"])
+def test_the_setting_chooses_the_network_of_fits_and_of_the_filter(walk, body, which):
+    _, _, points = walk
+    uv, settings = pixels(points, CAMERA.params), PeopleFit(lifter=which)
+    network = lift.load_lifter(lift.ASSETS[which])
+    scene = fit.make_scene(CAMERA, body, FPS, settings)
+    guess = fit.guess_postures(scene, uv, SIGMA, FPS, settings)
+    arrays = (jnp.asarray(a) for a in (CAMERA.params, uv, SIGMA, FPS))
+    wanted, _ = lift.lift(network, *arrays)
+    np.testing.assert_allclose(guess.latent, wanted.latent, atol=1e-4)
+    assert PersonFilter(CAMERA, body, FPS, settings).lifter is network
+
+
+def test_guesses_of_no_scale_are_trusted_nowhere(walk, body):
+    _, _, points = walk
+    scene = fit.make_scene(CAMERA, body, FPS, UNSEEN)
+    given = scene, pixels(points, CAMERA.params), SIGMA, FPS
+    guess = fit.guess_postures(*given, PeopleFit(lifter="held-out", lift_scale=0.0))
+    assert np.isinf(guess.latent_sigma).all() and np.isinf(guess.turn_sigma).all()

@@ -63,7 +63,6 @@ def fitting() -> tuple[g.State, dict[str, g.Factor]]:
         g.AspectRatioPrior(ones(1)),
         g.RootOrientation(eye(3, 1, T), ones(1, T), zeros(1, T)),
         g.RootPositionPrior(ones(1, T, 3), ones(1, T, 2), zeros(1, T)),
-        g.UprightPrior(jnp.array([0.0, -1, 0]), ones(1, T)),
         g.GroundContact(
             body,
             jnp.array([0.0, -1, 0]),
@@ -167,8 +166,7 @@ def test_an_invalid_state_is_refused(where, value, message):
             zeros(1, T, 3),
             "a depth of 0.0 m, expected above 0",
         ),
-        ("UprightPrior", "up", ones(4), "(4,), expected (3,)"),
-        ("UprightPrior", "up", 2 * ones(3), "a direction of length 3.464, expected 1"),
+        ("GroundContact", "normal", ones(4), "(4,), expected (3,)"),
         ("GroundContact", "normal", lambda x: x / 1.5, "length 0.6667, expected 1"),
     ],
 )
@@ -381,7 +379,6 @@ def test_a_mask_takes_the_precision_of_the_state():
 EARLY = {
     "RootSmoothness": lambda: g.RootSmoothness(ones(1, T)),
     "AngularAccelerationPrior": lambda: g.AngularAccelerationPrior(ones(1, T)),
-    "RelativeOrientation": lambda: g.RelativeOrientation(zeros(1, T, 3), ones(1, T)),
 }
 
 
@@ -392,7 +389,6 @@ EARLY_FRAMES = [
     ("BodyPosePrior", "correlation", 0),
     ("RootOrientation", "correlation", 0),
     ("RootPositionPrior", "correlation", 0),
-    ("RelativeOrientation", "sigma", 0),
     ("RootSmoothness", "sigma", 0),
     ("RootSmoothness", "sigma", 1),
     ("AngularAccelerationPrior", "sigma", 1),

@@ -569,7 +569,8 @@ def test_marginal_covariances_are_blocks_of_the_inverse(options, monkeypatch):
 
 
 @pytest.mark.slow
-def test_steps_and_covariances_do_not_depend_on_how_chunks_stand(monkeypatch):
+def test_covariances_do_not_depend_on_how_chunks_stand(monkeypatch):
+    """Steps of chunks in another order are those of dense equations, see above."""
     own_sizes(monkeypatch)
     in_time, state, _ = make(9, frames=63, people=2, landmarks=80)
     assert in_time.layout.order is None
@@ -579,11 +580,6 @@ def test_steps_and_covariances_do_not_depend_on_how_chunks_stand(monkeypatch):
     problem = g.make_problem(in_time.factors, state)
     assert problem.layout.order.tolist() == order.tolist()
     assert problem.layout.reach == 6
-    step, same = (
-        structured_step(*pad(p, state), jnp.asarray(1e-3)) for p in (problem, in_time)
-    )
-    one, other = ravel_pytree(step)[0], ravel_pytree(same)[0]
-    assert (abs(one - other) < 1e-9 * abs(other).max()).all()
     found, expected = marginals(problem, state), marginals(in_time, state)
     for name in ("scale", "cameras", "people", "shapes", "landmarks"):
         one, other = getattr(found, name), getattr(expected, name)
@@ -781,7 +777,7 @@ def test_covariances_are_as_large_as_errors_on_simulated_noise(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
     bench = importlib.import_module("solver_calibration")
     # A tenth of the noise that videos have: covariances are those of the linear part.
-    found = bench.calibration(20, draws=100, noise=0.1)["squared"]
+    found = bench.calibration(20, draws=60, noise=0.1)["squared"]
     for name in ("cameras, m", "people, m", "landmarks, m"):
         square, inside = found[name]
         assert abs(square - 1) < 0.15, name

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from bodyslam_jax import simulation
+from bodyslam_jax import pipeline, simulation
 from bodyslam_jax.body import load_body_model
-from bodyslam_jax.config import Simulation
+from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.experiments.video import filmed
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.motion import read_motion
 from bodyslam_jax.people import lift, posture_prior
+from bodyslam_jax.pipeline import case, run_folder
 from bodyslam_jax.simulation.gait_synthesis import Soles
 from bodyslam_jax.simulation.posing import Person
 from bodyslam_jax.simulation.sequences import OTHER, RECORDINGS, play
@@ -25,13 +26,37 @@ def person():
     return Person(load_body_model(), np.random.default_rng(3).uniform(-2, 2, 10))
 
 
-def test_people_of_the_recordings_are_unknown_to_prior_and_lifter(clips):
+def test_simulated_people_are_unknown_to_prior_and_held_out_lifter(clips):
     trials = [trial for trial, _ in RECORDINGS.values()]
     assert set(RECORDINGS) == set(simulation.LENGTH) and set(trials) == set(clips)
     who = {clip.subject.partition("#")[0] for clip in clips.values()}
     assert who == {trial.partition("_")[0] for trial in trials}
-    for asset in (lift.ASSET, posture_prior.ASSET):
+    walkers = read_motion(simulation.motion_file(None))
+    who |= {clip.subject.partition("#")[0] for clip in walkers}
+    for asset in (lift.HELD_OUT_ASSET, posture_prior.ASSET):
         assert who <= set(np.load(asset)["held_out_subjects"])
+    # What is used by default has learnt from all of them.
+    assert not len(np.load(lift.ASSET)["held_out_subjects"])
+
+
+def test_demo_and_cases_use_the_held_out_lifter(tmp_path, monkeypatch):
+    class Stopped(Exception):
+        pass
+
+    used = []
+
+    def stop(*given):
+        used.extend(part for part in given if isinstance(part, Config))
+        raise Stopped
+
+    monkeypatch.setattr(run_folder, "with_compatible_body", stop)
+    monkeypatch.setattr(case, "before_joint", stop)
+    with pytest.raises(Stopped):
+        pipeline.demo(tmp_path, Config(overlay=False))
+    with pytest.raises(Stopped):
+        case.simulate_case("E1", frames=20, config=Config(fps=30.0))
+    assert [config.people_fit.lifter for config in used] == ["held-out"] * 2
+    assert not used[0].overlay and used[1].fps == 30.0  # all else as given
 
 
 @pytest.mark.parametrize("trial", ["14_32", "06_12", "02_04", "14_33"])

@@ -2,8 +2,9 @@
 
     python tools/judge_postures.py DATA_FOLDER [PRIOR.npz LIFTER.npz]...
 
-Each pair of files is a row; without any, what ships is judged. Of the sequences of
-`HELD_OUT`, walking and other motion apart:
+Each pair of files is a row; without any, the prior and the held-out lifter that ship
+are judged. Of the sequences of people of `HELD_OUT` of whom no file learnt, walking and
+other motion apart:
 
 - *projection*: distance, mm, from postures to what is left of them in the prior's 32
   components (22 joints about the pelvis, mean shape);
@@ -33,12 +34,12 @@ from lifter_scene import (
     read_motions,
     watch,
 )
-from make_posture_prior import HELD_OUT, LEVER
+from make_posture_prior import LEVER, unknown_to
 
 from bodyslam_jax import people
 from bodyslam_jax.body import load_body_model
 from bodyslam_jax.evaluation.metrics import pa_mpjpe
-from bodyslam_jax.people.lift import ASSET, Lifter, lift, load_lifter
+from bodyslam_jax.people.lift import HELD_OUT_ASSET, Lifter, lift, load_lifter
 from bodyslam_jax.people.posture_prior import ASSET as PRIOR
 from bodyslam_jax.people.posture_prior import PosturePrior
 from bodyslam_jax.people.skeleton import NUM_SHAPE, Skeleton, make_skeleton
@@ -125,12 +126,14 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("files", type=Path, nargs="*")
     options = parser.parse_args()
-    files = options.files or [PRIOR, ASSET]
+    files = options.files or [PRIOR, HELD_OUT_ASSET]
     skeleton = make_skeleton(load_body_model(), 0.0)
-    motions = read_motions(options.data, HELD_OUT, True, (0,))
+    motions = read_motions(options.data, unknown_to(files), True, (0,))
     kinds = {"walking": [m for m in motions if m.walks]}
     kinds["other"] = [m for m in motions if not m.walks]
     for kind, chosen in kinds.items():
+        if not chosen:
+            continue
         print(f"{kind}, {len(chosen)} sequences: {', '.join(MEASURES)}")
         first = None
         for prior_file, lifter_file in zip(files[::2], files[1::2], strict=True):

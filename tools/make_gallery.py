@@ -51,7 +51,8 @@ def main() -> None:
         simulated = simulation.simulate(filmed(plain), body)
         film = simulation.film_scene(options.folder / f"{name}-film", simulated)
         out = options.folder / name
-        result = run_to_folder(io.read_sequence(film), out, Config())
+        config = Config().for_simulated_people()
+        result = run_to_folder(io.read_sequence(film), out, config)
         pair = evaluation.associate(result, simulation.as_truth(simulated), body)
         errors = {k: float(v) for k, v in evaluation.evaluate(*pair).items()}
         picture = read_frame(out / "overlay.webm", options.share)

@@ -32,6 +32,12 @@ LEVER = np.array(
 ).repeat(3)
 
 
+def unknown_to(files: list[Path]) -> tuple[str, ...]:
+    """The subjects of whom none of these files learnt."""
+    unknown = [set(np.load(file)["held_out_subjects"].tolist()) for file in files]
+    return tuple(sorted(set(HELD_OUT).intersection(*unknown)))
+
+
 def archives(folder: Path) -> Iterator[tuple[str, dict[str, np.ndarray], np.ndarray]]:
     """Name and arrays of each file, and which of its sequences may be used at all."""
     for name in FILES:

@@ -1,22 +1,28 @@
 """Trains the network that guesses postures from keypoints (`bodyslam_jax.people`).
 
-    python tools/train_lifter.py DATA_FOLDER OUT.npz [--steps 6000] [--start FILE]
+    python tools/train_lifter.py DATA_FOLDER OUT.npz [--steps 6000]
+    python tools/train_lifter.py DATA_FOLDER OUT.npz --start FILE
+        [--also SUBJECT... | --everybody]
     python tools/train_lifter.py DATA_FOLDER OUT.npz --judge [--start FILE]
 
 `DATA_FOLDER` holds the files that `make_posture_prior.py` reads. A first training
 leaves out `CALIBRATION` too, to see by how much deviations are too small for people
 that were not learnt from; a second one has them. A quarter of an hour on two cores.
 `--start` goes on training another network in its place, whose deviations are widened as
-those of the network that ships were. `--judge` trains nothing: people of `HELD_OUT`,
-seen by made-up cameras, are fitted with the network in OUT.npz and without one, or with
-that of `--start`; `judge_postures.py` judges guesses alone. What came out is in
+those of that network were. Then `--also` learns from some of the people of `HELD_OUT`,
+too, as a fold does, and `--everybody` from all of them, as the network that ships did.
+By how much deviations are too small cannot be seen of people who were learnt from: the
+factors remain those that were found while these people were held out. `--judge` trains
+nothing: people of `HELD_OUT` of whom nothing was learnt, seen by made-up cameras, are
+fitted with the network in OUT.npz and without one, or with that of `--start`;
+`judge_postures.py` judges guesses alone. What came out is in
 `bodyslam_jax/people/assets/README.md`.
 """
 
 import argparse
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -36,7 +42,7 @@ from lifter_scene import (
     standing,
     watch,
 )
-from make_posture_prior import HELD_OUT
+from make_posture_prior import HELD_OUT, unknown_to
 
 from bodyslam_jax import people
 from bodyslam_jax.body import load_body_model
@@ -70,8 +76,7 @@ BATCH = 512
 LEGS = [4, 5, 7, 8, 10, 11]
 
 
-@dataclasses.dataclass(frozen=True)
-class Examples:
+class Examples(NamedTuple):
     """Frames as the network sees them, and the truth."""
 
     x: np.ndarray
@@ -234,11 +239,11 @@ def errors(
     }
 
 
-def save(network: Lifter, path: Path) -> None:
+def save(network: Lifter, path: Path, held_out: tuple[str, ...] = HELD_OUT) -> None:
     np.savez_compressed(
         path,
         **{n: np.asarray(a, np.float16) for n, a in vars(network).items()},
-        held_out_subjects=np.array(HELD_OUT),
+        held_out_subjects=np.array(held_out, dtype="U8"),
         source="CMU Graphics Lab Motion Capture Database, mocap.cs.cmu.edu",
     )
 
@@ -252,22 +257,13 @@ def widened(network: Lifter, posture: float, turn: float) -> Lifter:
     return eqx.tree_at(lambda n: n.last_bias, network, bias)
 
 
-def learn(folder: Path, out: Path, steps: int, start: Path | None) -> None:
+def learn(folder: Path, out: Path, steps: int) -> None:
+    """A first training."""
     skeleton, prior = make_skeleton(load_body_model(), 0.0), load_posture_prior(30.0)
-    phases = PHASES if start is None else PHASES[::2]
     examples = lambda subjects, inside, seed: make_examples(
-        read_motions(folder, subjects, inside, phases), seed
+        read_motions(folder, subjects, inside, PHASES), seed
     )
     single = jax.tree.map(lambda a: a.astype(jnp.float32), (skeleton, prior))
-    if start is not None:
-        network = widened(load_lifter(start), *(1 / w for w in WIDER.values()))
-        motions = read_motions(folder, HELD_OUT, False, phases)
-        data = make_examples(motions, 0, FEWER_VIEWS)
-        print(f"{len(data.x)} frames to learn from", flush=True)
-        network = widened(train(data, steps, *single, start=network), **WIDER)
-        save(network, out)
-        print("held out:", errors(network, examples(HELD_OUT, True, seed=2), *single))
-        return
     data = examples((*HELD_OUT, *CALIBRATION), False, seed=0)
     others = examples(CALIBRATION, True, seed=1)
     print(f"{len(data.x)} frames to learn from, {len(others.x)} to calibrate with")
@@ -280,13 +276,35 @@ def learn(folder: Path, out: Path, steps: int, start: Path | None) -> None:
     print("held out:", errors(network, examples(HELD_OUT, True, seed=2), *single))
 
 
+def learn_further(
+    folder: Path, out: Path, steps: int, start: Path, also: tuple[str, ...]
+) -> None:
+    """From another network, and from the people `also` of `HELD_OUT` too."""
+    skeleton, prior = make_skeleton(load_body_model(), 0.0), load_posture_prior(30.0)
+    single = jax.tree.map(lambda a: a.astype(jnp.float32), (skeleton, prior))
+    held_out = tuple(sorted(set(HELD_OUT) - set(also)))
+    read = lambda who, inside: read_motions(folder, who, inside, PHASES[::2])
+    # Each person's views are the same whoever else is learnt from.
+    data = [make_examples(read(HELD_OUT, False), 0, FEWER_VIEWS)]
+    data += [make_examples(read((who,), True), int(who), FEWER_VIEWS) for who in also]
+    data = jax.tree.map(lambda *parts: np.concatenate(parts), *data)
+    print(f"{len(data.x)} frames to learn from", flush=True)
+    network = widened(load_lifter(start), *(1 / w for w in WIDER.values()))
+    network = widened(train(data, steps, *single, start=network), **WIDER)
+    save(network, out, held_out)
+    if held_out:
+        others = make_examples(read(held_out, True), 2, FEWER_VIEWS)
+        print("held out:", errors(network, others, *single))
+
+
 def judge(folder: Path, network: Path, start: Path | None) -> None:
     """Fits to keypoints of the held-out people, with guesses and without, or else with
     those of `start`."""
     body = load_body_model()
     skeleton = make_skeleton(body, 0.0)
+    unknown = unknown_to([network] if start is None else [network, start])
     motions = [
-        m for m in read_motions(folder, HELD_OUT, True, (0,)) if len(m.poses) > 59
+        m for m in read_motions(folder, unknown, True, (0,)) if len(m.poses) > 59
     ]
     camera = Intrinsics(CAMERA, *SIZE)
     settings = {
@@ -306,7 +324,7 @@ def judge(folder: Path, network: Path, start: Path | None) -> None:
         true = np.einsum("tij,tkj->tki", view.T_CH[:, :3, :3], true)
         found = [motion.walks]
         for chosen, path in settings.values():
-            fit.load_lifter = lambda path=path: lift.load_lifter(path)
+            fit.load_lifter = lambda _, path=path: lift.load_lifter(path)
             bodies = people.fit_bodies(seen, camera, body, 30.0, chosen)
             roots = people.roots_from_bodies(bodies, body)
             shape = np.concatenate([roots.shape[0], np.zeros(NUM_SHAPE - 10)])
@@ -339,12 +357,19 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--start", type=Path)
+    parser.add_argument("--also", nargs="+", choices=HELD_OUT, default=())
+    parser.add_argument("--everybody", action="store_true")
     parser.add_argument("--judge", action="store_true")
     options = parser.parse_args()
     if options.judge:
         judge(options.data, options.out, options.start)
+    elif options.start is None:
+        if options.also or options.everybody:
+            parser.error("--also and --everybody need --start")
+        learn(options.data, options.out, options.steps)
     else:
-        learn(options.data, options.out, options.steps, options.start)
+        also = HELD_OUT if options.everybody else tuple(options.also)
+        learn_further(options.data, options.out, options.steps, options.start, also)
 
 
 if __name__ == "__main__":

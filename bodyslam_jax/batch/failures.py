@@ -86,6 +86,7 @@ def add(folder: Path, outcome: Outcome) -> None:
 def _locked(folder: Path) -> Iterator[None]:
     # A symbolic link of this name is not followed.
     flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+    # Permissions are what the umask leaves of these.
     with os.fdopen(os.open(folder / ".failed.lock", flags, 0o666), "r+b") as lock:
         if fcntl is not None:
             with contextlib.suppress(OSError):  # a file system without locks

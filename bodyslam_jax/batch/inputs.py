@@ -128,6 +128,7 @@ def is_file_name(name: str) -> bool:
     signs = "/\\" if os.name == "nt" else "/"
     plain = name.isprintable() or not any(sign in name for sign in "\0\n\r")
     return (
+        # File systems allow 255 bytes, and suffixes follow.
         0 < size <= 240
         and plain
         and name not in (".", "..")

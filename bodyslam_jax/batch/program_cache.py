@@ -65,7 +65,10 @@ class ProgramCache:
         self._path = Path(path)
         self._path.mkdir(parents=True, exist_ok=True)
         self._lock_file = os.open(
-            self._path / _LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666
+            # Permissions are what the umask leaves of these.
+            self._path / _LOCK_FILE,
+            os.O_RDWR | os.O_CREAT,
+            0o666,
         )
         weakref.finalize(self, os.close, self._lock_file)
         self._held: dict[str, int] = {}
@@ -134,6 +137,7 @@ def _place(key: str) -> int:
     """Returns the byte of the lock file that represents a key, which ends in its
     hash."""
     text = key.encode()
+    # 32 bits above 28 are the 60 of the range.
     return (zlib.crc32(text) << 28 | zlib.adler32(text) >> 4) % _LOCK_RANGE_BYTES
 
 

@@ -59,13 +59,14 @@ _FILE_NAMES = (
     "smplx/SMPLX_{G}.npz",
     "smplx/SMPLX_{G}.pkl",
 )
-# Vertices of SURFACE_POINTS in SMPL's meshes (`vertex_ids.py` of smplx; the top of the
-# head is found as the highest vertex).
 _PICKS_BY_MESH_SIZE = {
     6890: (332, 6260, 2800, 4071, 583, 3216, 3226, 3387, 6617, 6624, 6787),
     10475: (9120, 9929, 9448, 616, 6, 5770, 5780, 8846, 8463, 8474, 8635),
 }
-_KIND_BY_JOINTS = {24: "smpl", 52: "smplh", 55: "smplx"}
+"""Vertices of SURFACE_POINTS in the meshes of SMPL and SMPL-X, by their numbers of
+vertices (`vertex_ids.py` of smplx; the top of the head is the highest vertex)."""
+KIND_BY_JOINTS = {24: "smpl", 52: "smplh", 55: "smplx"}
+"""Body models by their number of joints."""
 _LIBRARIES = ("chumpy", "scipy.sparse")
 _MAX_DEPTH = 8
 """Largest depth of nested chumpy expressions that are evaluated."""
@@ -121,9 +122,7 @@ def check(path: str | Path, gender: str | None = None) -> str:
     raw = checked(file, read_arrays(file))
     num_vertices, num_joints = raw["weights"].shape
     stature = np.ptp(raw["v_template"][:, 1])
-    kind = (
-        "the default body" if file == DEFAULT else _KIND_BY_JOINTS[num_joints].upper()
-    )
+    kind = "the default body" if file == DEFAULT else KIND_BY_JOINTS[num_joints].upper()
     return (
         f"{file}: {kind}, {num_vertices} vertices, {len(raw['f'])} faces, "
         f"{num_joints} joints, {raw['shapedirs'].shape[2]} shape components, "
@@ -279,7 +278,7 @@ def _assemble(file: Path, raw: dict[str, np.ndarray]) -> dict:
         "blocks": runs_of_vertices(weights),
         "picks": raw["picks"] if "picks" in raw else _picks(template, regressor),
         "name": file.stem,
-        "kind": "default" if file == DEFAULT else _KIND_BY_JOINTS[num_joints],
+        "kind": "default" if file == DEFAULT else KIND_BY_JOINTS[num_joints],
     }
 
 

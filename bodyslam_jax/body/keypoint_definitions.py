@@ -37,10 +37,13 @@ _COCO: _Offsets = {
     "knee": _KNEE,
     "ankle": (0.0, 1.3, 0.6),
 }
+"""Of MoveNet, which was trained on COCO: measured on rendered people
+(`benchmarks/keypoints.md`), as are the next two."""
 _BLAZEPOSE_FEET: _Offsets = {
     "big_toe": (2.9, 0.0, -3.7),
     "heel": (0.0, 0.3, 2.0),
 }
+"""Of toes and heels of BlazePose."""
 _MEDIAPIPE: _Offsets = {
     "eye": (0.0, 0.3, -1.5),
     "ear": (-0.8, 0.2, 0.8),
@@ -55,6 +58,7 @@ _MEDIAPIPE: _Offsets = {
     "ankle": (-0.4, 1.2, 1.1),
     **_BLAZEPOSE_FEET,
 }
+"""Of MediaPipe's BlazePose."""
 _OPENPOSE: _Offsets = {
     "neck": (0.0, -3.8, 0.0),
     "mid_hip": (0.0, -0.8, 0.5),

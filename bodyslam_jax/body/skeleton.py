@@ -181,12 +181,13 @@ _SPREAD_BY_PART = {
     "neck": 0.079,
     "top": 0.035,
 }
+"""σ of COCO's and COCO-WholeBody's OKS; neck and head by analogy."""
 KEYPOINT_SPREAD: dict[str, tuple[float, ...]] = {
     layout: tuple(_SPREAD_BY_PART[name.rsplit("_", 1)[-1]] for name in names)
     for layout, names in KEYPOINT_NAMES.items()
 }
 """Standard deviation of COCO's annotators, relative to the square root of the person's
-area in pixels (σ of COCO's and COCO-WholeBody's OKS; neck and head by analogy)."""
+area in pixels."""
 KEYPOINT_JOINT: dict[str, int] = {
     "mid_hip": 0,
     **{name: j for j, name in enumerate(JOINT_NAMES) if "spine" not in name},

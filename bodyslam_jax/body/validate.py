@@ -60,6 +60,7 @@ def checked(file: Path, raw: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if (weights < -1e-6).any():
         raise InputError(f"{file}: weights has negative entries, expected 0 to 1.")
     stature = float(np.ptp(template[:, 1]))
+    # No human has either stature, m: other units, then.
     if not 0.2 < stature < 4:
         raise InputError(
             f"{file}: the body is {stature:.3g} m tall (y axis), expected 0.2 to 4 m."

@@ -27,7 +27,6 @@ _Experiment = Literal[
     "landmarks",
     "motion",
     "ablation",
-    "weights",
     "video",
     "calibration",
 ]

@@ -133,6 +133,7 @@ class Known:
                     )
                 person = int(who)
             height = _measured("height", number, HEIGHT_SIGMA, "METRES or METRES±SIGMA")
+            # Newborns have 0.5 m; the tallest person on record had 2.72 m.
             if not 0.4 <= height.value <= 2.8:
                 raise InputError(
                     f"height: found {height.value:g}, expected 0.4 to 2.8 m."

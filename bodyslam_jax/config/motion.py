@@ -100,6 +100,7 @@ class MotionTraining:
             width=(1024,),
             epochs=100,
             learning_rate=1e-3,
+            # The batch of section 3.4.
             segments=4096,
             steps=1,
             decay=False,

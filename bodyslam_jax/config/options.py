@@ -13,8 +13,8 @@ from bodyslam_jax.config.errors import InputError
 S = TypeVar("S")
 REMOVED = {
     "people_fit.walking_knees": "knees are as measured",
-    "weights.orientation_sigma": "pipeline.run(factors=) takes RelativeOrientation",
-    "weights.upright_sigma": "pipeline.run(factors=) takes UprightPrior",
+    "weights.orientation_sigma": "it changed nothing",
+    "weights.upright_sigma": "it changed nothing",
 }
 """Settings of earlier versions, with the stage before a dot, and their replacement."""
 _BOOL_BY_WORD = {"true": True, "yes": True, "false": False, "no": False}

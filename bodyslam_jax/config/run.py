@@ -105,6 +105,12 @@ class Config(Known):
             smoothing_hz=None,
         )
 
+    def for_simulated_people(self) -> "Config":
+        """Returns the settings with networks that have not been trained on the people
+        whose motion simulated people have, for errors against their truth."""
+        fit = dataclasses.replace(self.people_fit, lifter="held-out")
+        return dataclasses.replace(self, people_fit=fit)
+
 
 @dataclasses.dataclass(frozen=True)
 class Distribution:

@@ -113,6 +113,7 @@ class GraphWeights:
         other differences.
         """
         return cls(
+            # λ = 64 / b² of the paper, with b = 2.25 px.
             pixel_sigma=2.25 / 8,
             landmark_loss=1.0,
             keypoint_sigma=1.0,

@@ -62,14 +62,24 @@ def inflate_fitted_shapes(
             lengths, whose errors are independent.
     """
     weight = np.maximum(shape_sigma**-2.0, 1.0)
-    more = weight * (weight - 1)
+    more = jnp.asarray(weight * (weight - 1))
     extra = more[:, None, None] * (shape_covariance @ shape_covariance)
-    slope = jax.vmap(jax.grad(lambda shape: jnp.log(leg_length(body, shape))))(shapes)
-    legs = jnp.einsum("hi,hij,hj->h", slope, extra, slope)
+    legs = leg_variance(body, shapes, extra)
     variance = (
         scale_variance + scale**2 * jnp.sum(legs[present]) / float(present.sum()) ** 2
     )
     return variance, shape_covariance + extra
+
+
+def leg_variance(
+    body: BodyModel,
+    shapes: Float[Array, "h 10"],
+    covariance: Float[Array, "h 10 10"],
+) -> Float[Array, " h"]:
+    """Returns the relative variance of each person's leg length, by the covariance of
+    β."""
+    slope = jax.vmap(jax.grad(lambda shape: jnp.log(leg_length(body, shape))))(shapes)
+    return jnp.einsum("hi,hij,hj->h", slope, covariance, slope)
 
 
 def cue_discrepancy(start: ScaleStart) -> float:

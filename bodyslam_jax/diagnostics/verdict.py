@@ -29,6 +29,10 @@ from bodyslam_jax.diagnostics.person_verdict import (
     with_doubts,
     with_more_doubts,
 )
+from bodyslam_jax.diagnostics.place_uncertainty import (
+    PlaceUncertainty,
+    place_uncertainty,
+)
 from bodyslam_jax.diagnostics.plausibility import implausible
 from bodyslam_jax.diagnostics.reprojection import per_frame
 from bodyslam_jax.diagnostics.scale_uncertainty import (
@@ -69,6 +73,9 @@ class Verdict:
     """Figures of each frame (`reprojection.per_frame`)."""
     joint_sigma: Float[np.ndarray, "h t 24"]
     """Expected error of each joint within the body, m (`measured.Measured`)."""
+    places: PlaceUncertainty | None
+    """Standard deviations of people's places and of the camera's height; `None` where
+    they were not computed, or nothing determines the scale."""
     up: Upright
     """The vertical, and the cues that determined it."""
     accuracy: Accuracy
@@ -133,6 +140,15 @@ def assess(
         for person in people
     ]
     lengths = accuracy(sequence, cameras, result, up, sizes, config.structure)
+    places = place_uncertainty(
+        joint,
+        result,
+        found.joint_sigma,
+        np.array(sizes),
+        scale_sigma=scale_sigma if cameras.kind == "moving" else 0.0,
+        up_sigma=lengths.up,
+        focal_sigma=lengths.focal,
+    )
     warnings = _warnings(sequence, cameras, joint, ground_factor)
     warnings += guess_warning(sequence, cameras, lengths)
     warnings += warnings_of_people(people)
@@ -172,6 +188,7 @@ def assess(
         people=tuple(people),
         per_frame=per_frame(sequence, body, cameras, joint),
         joint_sigma=found.joint_sigma,
+        places=places,
         up=up,
         accuracy=lengths,
         given=of_given,

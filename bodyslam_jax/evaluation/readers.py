@@ -62,6 +62,8 @@ _SCHEMA: dict[str, Any] = {
             "reasons": [(str, _REASON_SCHEMA)],
             "stature_m": float,
             "stature_sigma_m": float,
+            "place_sigma_m": float,
+            "height_sigma_m": float,
             "speed_m_s": float,
         }
     ],
@@ -88,6 +90,7 @@ def read_result(path: Path) -> Result:
     }
     if fields["timestamps"].size == 0 or (np.diff(fields["timestamps"]) <= 0).any():
         raise InputError(f"{file}: `timestamps` do not increase, or there is none.")
+    # fx fy cx cy, or with the four distortion coefficients of OPENCV.
     if len(fields["intrinsics"]) not in (4, 8) or (fields["intrinsics"][:2] <= 0).any():
         raise InputError(
             f"{file}: `intrinsics` are {fields['intrinsics'][:8].tolist()}, expected "
@@ -96,9 +99,9 @@ def read_result(path: Path) -> Result:
     _check_rigid(file, fields["T_WC"])
     fields["scale"] = float(fields["scale"])
     fields["present"] = archive.array("present", ("h", "t"), kind="boolean")
-    if "joint_sigma" in archive:
-        shape = ("h", "t", 24)
-        fields["joint_sigma"] = archive.array("joint_sigma", shape, low=0)
+    for name, width in (("joint_sigma", 24), ("root_sigma", 3)):
+        if name in archive:
+            fields[name] = archive.array(name, ("h", "t", width), low=0)
     summary_file = file.with_name("summary.json")
     summary = read_summary(summary_file) if summary_file.exists() else {}
     return Result(**fields, summary=summary)

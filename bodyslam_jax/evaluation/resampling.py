@@ -119,6 +119,7 @@ def bracket(times: Float[np.ndarray, " t"], at: Float[np.ndarray, " u"]) -> Brac
         gap <= 1.5 * interval
     )
     distance = np.minimum(abs(at - times[before]), abs(at - times[after]))
+    # Half an interval, and rounding.
     available = blend | (distance <= 0.5001 * interval)
     return Brackets(before, after, np.where(blend, weight, nearest), available)
 

@@ -9,7 +9,6 @@ from bodyslam_jax.config import Experiment as Experiment
 from bodyslam_jax.experiments.ablation import VARIANTS as VARIANTS
 from bodyslam_jax.experiments.ablation import ablate as ablate
 from bodyslam_jax.experiments.ablation import as_published as as_published
-from bodyslam_jax.experiments.ablation import compare_orders as compare_orders
 from bodyslam_jax.experiments.ablation import landmark_ablation as landmark_ablation
 from bodyslam_jax.experiments.ablation import with_motion_model as with_motion_model
 from bodyslam_jax.experiments.ablation import with_weights as with_weights
@@ -24,14 +23,3 @@ from bodyslam_jax.experiments.scenario import errors as errors
 from bodyslam_jax.experiments.scenario import score as score
 from bodyslam_jax.experiments.scenario import score_of as score_of
 from bodyslam_jax.experiments.scenario import without_map as without_map
-from bodyslam_jax.experiments.weights import WEIGHTS as WEIGHTS
-from bodyslam_jax.experiments.weights import Learned as Learned
-from bodyslam_jax.experiments.weights import Trial as Trial
-from bodyslam_jax.experiments.weights import error_and_gradient as error_and_gradient
-from bodyslam_jax.experiments.weights import judge as judge
-from bodyslam_jax.experiments.weights import learn_weights as learn_weights
-from bodyslam_jax.experiments.weights import make_trial as make_trial
-from bodyslam_jax.experiments.weights import names_of as names_of
-from bodyslam_jax.experiments.weights import outcome as outcome
-from bodyslam_jax.experiments.weights import reweighted as reweighted
-from bodyslam_jax.experiments.weights import training_error as training_error

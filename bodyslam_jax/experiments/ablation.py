@@ -2,7 +2,7 @@
 estimate.
 
 The input is a `Case` with its prepared problem; the output are the errors against the
-truth, and the solver's status, steps and processor time.
+truth, and the solver's status, steps and time.
 
 A variant is a joint problem with factors disabled or added, or variables held constant
 (`VARIANTS`).
@@ -14,7 +14,6 @@ with and without landmarks.
 """
 
 import dataclasses
-import time
 from collections.abc import Callable
 
 import equinox as eqx
@@ -22,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from bodyslam_jax import graph, motion, solver
+from bodyslam_jax import graph, motion
 from bodyslam_jax.config import Config, GraphWeights
 from bodyslam_jax.experiments.scenario import NAMES, score_of, with_scale, without_map
 from bodyslam_jax.pipeline.case import Case
@@ -44,9 +43,6 @@ SETTINGS: dict[str, GraphWeights] = {
 """Alternative weights, with which scale and bodies are initialised, too."""
 PUBLISHED = "as published"
 """Label of the paper's weights, motion network and first-order schedule together."""
-ORDERS = ("second order", "first order, as long", "first order, 200 + 100 steps")
-_TIMED_STEPS = 20
-"""Number of steps over which the time of one step is measured."""
 _SCALE_FACTORS = (
     graph.HumanMotion,
     graph.RootSmoothness,
@@ -102,30 +98,6 @@ def as_published(case: Case) -> dict[str, float | str]:
     return _past(config) | _solved(case, case.prepare(config), config)
 
 
-def compare_orders(case: Case, prepared: Prepared) -> dict[str, dict[str, float | str]]:
-    """Compares the structured solver with Adam: at equal processor time, and as in the
-    paper.
-
-    Times are without compilation. Adam has the same start, the paper's learning rate
-    and, at equal time, all variables free from the first step.
-    """
-    problem, state = prepared.problem, prepared.state
-    schedule = solver.PAPER_SCHEDULE
-    run = lambda: solver.solve(problem, state, schedule=schedule)
-    solution, seconds = _timed(run)
-    rows = {ORDERS[0]: _row(case, prepared, solution.state, {}, solution, seconds)}
-    per_step = _time_of_gradient(problem, state)
-    count = max(int(seconds / per_step), _TIMED_STEPS)
-    equal = (solver.Stage(max_steps=count),)
-    paper = solver.paper_schedule("adam")
-    for name, stages in zip(ORDERS[1:], (equal, paper), strict=True):
-        found = solver.solve(problem, state, solver="adam", schedule=stages)
-        steps = sum(stage.max_steps for stage in stages)
-        row = _row(case, prepared, found.state, {}, found, per_step * steps)
-        rows[name] = {**row, "steps": float(steps)}
-    return rows
-
-
 def _past(config: Config) -> dict[str, float | str]:
     """Returns the number of past frames that the motion model reads."""
     return {"past": float(motion.load_motion_model(config.motion_model).past)}
@@ -144,47 +116,9 @@ def _solved(
     return _row(case, prepared, solution.state, stage)
 
 
-def _timed(run) -> tuple[solver.Solution, float]:
-    """Returns the result and the processor time (s) of a second run; the first one
-    compiles."""
-    jax.block_until_ready(run())
-    start = time.process_time()
-    solution = jax.block_until_ready(run())
-    return solution, time.process_time() - start
-
-
-def _time_of_gradient(problem: graph.Problem, state: graph.State) -> float:
-    """Returns the processor time of one gradient of the cost, s, which is that of a
-    first-order step."""
-    zero = state.zero_step()
-
-    @eqx.filter_jit
-    def many(problem, state):
-        cost = lambda step: problem.cost(state.retract(step))
-
-        def one(step, _):
-            gradient = jax.grad(cost)(step)
-            return jax.tree.map(lambda x, g: x - 1e-12 * g, step, gradient), None
-
-        return jax.lax.scan(one, zero, length=_TIMED_STEPS)[0]
-
-    jax.block_until_ready(many(problem, state))
-    start = time.process_time()
-    jax.block_until_ready(many(problem, state))
-    return (time.process_time() - start) / _TIMED_STEPS
-
-
-def _row(case, prepared, state, stage, solution=None, seconds=None):
+def _row(case, prepared, state, stage):
     found = score_of(case, state, prepared.roots.present)
     row = {**found, "radius": case.radius, "scale_ratio": 1 / found["scale"]}
-    if solution is not None:
-        steps = sum(int(n) for n in solution.num_steps)
-        costs_of_solve = {
-            "status": solution.status,
-            "steps": float(steps),
-            "seconds": seconds,
-        }
-        return row | costs_of_solve | {"cost": float(solution.cost)}
     names = ("status", "iterations", "seconds", "cost_after")
     status, steps, taken, cost = (stage[name] for name in names)
     return row | {

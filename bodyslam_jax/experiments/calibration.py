@@ -29,8 +29,9 @@ from jaxtyping import Float
 
 from bodyslam_jax import body as body_
 from bodyslam_jax import evaluation, io, pipeline, simulation
-from bodyslam_jax.body.skeleton import PARENTS
+from bodyslam_jax.body.skeleton import FEET, PARENTS, PELVIS
 from bodyslam_jax.config import Config, Experiment, Simulation
+from bodyslam_jax.evaluation.errors import UP
 from bodyslam_jax.experiments.jobs import COMPILATION_S, Job, Row
 from bodyslam_jax.experiments.tables import (
     Column,
@@ -39,6 +40,8 @@ from bodyslam_jax.experiments.tables import (
     to_csv,
     write_text,
 )
+from bodyslam_jax.ground.gravity import upright
+from bodyslam_jax.ground.stances import find_stances
 from bodyslam_jax.pipeline.stage_cache import Cache
 from bodyslam_jax.simulation import sequences
 from bodyslam_jax.simulation.posing import Person
@@ -69,13 +72,20 @@ QUANTITIES = {
     "stature": "stature",
     "up": "up",
     "joints": "joints within the body",
+    "places": "pelvis on the floor (x, z)",
+    "heights": "pelvis over the floor (y)",
+    "camera": "first camera over the floor",
 }
-"""Claimed quantities by the field of a row; roots and heights have no claim yet."""
-CHI2_QUANTILES = {68: (0.989, 3.506), 95: (3.841, 7.815)}
-"""Quantiles of χ² at 68 and 95 % for one coordinate and for three."""
+"""Claimed quantities by the field of a row."""
+OVER_FRAMES = {"joints": 3, "places": 2, "heights": 1}
+"""Quantities with a claim in each frame, and their number of coordinates. A row has
+their root mean square and their coverage over its frames, so that a clip, whose errors
+are mostly common to all frames, counts once."""
+CHI2_QUANTILES = {68: (0.989, 2.279, 3.506), 95: (3.841, 5.991, 7.815)}
+"""Quantiles of χ² at 68 and 95 % for one, two and three coordinates."""
 FORM: dict[str, Any] = {
     **{f"z_{name}": float for name in QUANTITIES},
-    **{f"joints_within_{share}": float for share in CHI2_QUANTILES},
+    **{f"{n}_within_{share}": float for n in OVER_FRAMES for share in CHI2_QUANTILES},
     "input": str,
     "status": str,
 }
@@ -244,7 +254,7 @@ def claims(result: Result, scene: sequences.SimulatedSequence, body: Any) -> Row
     claimed.
 
     `z_up` and `z_joints` are root mean squares per coordinate: an angle has two, a
-    joint position three.
+    joint position three, a place on the floor two.
     """
     pair = evaluation.associate(result, simulation.as_truth(scene), body)
     errors = evaluation.evaluate(*pair)
@@ -265,28 +275,77 @@ def claims(result: Result, scene: sequences.SimulatedSequence, body: Any) -> Row
     tilt = math.degrees(float(errors["gravity_error"]))
     row["z_up"] = ratio(tilt / math.sqrt(2), up)
     row |= _of_joints(result, pair)
+    row |= _of_places(result, scene)
     return row
 
 
 def _of_joints(result: Result, pair: tuple[Any, Any]) -> Row:
     """Returns the z value and the coverage of joints, after alignment of the body in
     each frame, as `joint_sigma` (RMS distance within the body) is defined."""
-    none = {"z_joints": None, **{f"joints_within_{s}": None for s in CHI2_QUANTILES}}
     if result.joint_sigma is None or not len(result.joints):
-        return none
+        return _over_frames("joints", np.zeros(0))
     mine, theirs = pair
     present = np.asarray(mine.present & theirs.present)[0]
     if not present.any():
-        return none
+        return _over_frames("joints", np.zeros(0))
     x, y = np.asarray(mine.joints)[0][present], np.asarray(theirs.joints)[0][present]
     error = np.linalg.norm(_aligned(x, y) - y, axis=-1)
     sigma = _claimed_there(result, present)
     use = sigma > 0
-    squares = (error[use] / sigma[use]) ** 2
-    row: Row = {"z_joints": float(np.sqrt(squares.mean()))}
-    for share, (_, of_three) in CHI2_QUANTILES.items():
-        row[f"joints_within_{share}"] = float((3 * squares < of_three).mean())
+    return _over_frames("joints", 3 * (error[use] / sigma[use]) ** 2)
+
+
+def _over_frames(name: str, chi2: Float[np.ndarray, " n"]) -> Row:
+    """Returns the root mean square per coordinate and the coverage of a quantity with
+    one χ² for each claim; `None` without any."""
+    coordinates = OVER_FRAMES[name]
+    known = len(chi2) > 0
+    row: Row = {f"z_{name}": None}
+    if known:
+        row[f"z_{name}"] = float(np.sqrt(chi2.mean() / coordinates))
+    for share, quantiles in CHI2_QUANTILES.items():
+        inside = chi2 < quantiles[coordinates - 1]
+        row[f"{name}_within_{share}"] = float(inside.mean()) if known else None
     return row
+
+
+def _of_places(result: Result, scene: sequences.SimulatedSequence) -> Row:
+    """Returns z values and coverage of a person's place in W, and of the camera's
+    height.
+
+    The truth is taken to W as the estimate is: the first camera is its origin and gives
+    its heading, y is up by its own up. No alignment is fitted, because what W claims is
+    a place as seen from the first camera and the floor; an alignment of the paths
+    would remove most of the error of scale and of up. The floor is the median of the
+    places where feet truly stand.
+    """
+    row = _over_frames("places", np.zeros(0)) | _over_frames("heights", np.zeros(0))
+    row["z_camera"] = None
+    if result.root_sigma is None or not result.present[:1].any():
+        return row
+    truth = simulation.as_truth(scene)
+    joints, eye = in_world(truth, scene.room)
+    frames = np.flatnonzero(result.present[0, : len(truth.timestamps)])
+    error = result.joints[0, frames, PELVIS] - joints[0, frames, PELVIS]
+    chi2 = (error / result.root_sigma[0, frames]) ** 2
+    row |= _over_frames("places", chi2[:, 0] + chi2[:, 2])
+    row |= _over_frames("heights", chi2[:, 1])
+    sigma = result.summary["camera_height"]["sigma_m"]
+    row["z_camera"] = float((result.T_WC[0, 1, 3] - eye) / sigma) if sigma else None
+    return row
+
+
+def in_world(truth: Result, room: Room) -> tuple[Float[np.ndarray, "h t 24 3"], float]:
+    """Returns the true joints in W, m, and the true height of the first camera over the
+    floor, m."""
+    height = room.height if isinstance(room, Terrain) else floor_of(("level", 0.0, 0.0))
+    feet = truth.joints[:, :, list(FEET)]
+    places = np.concatenate(find_stances(feet, truth.present, truth.fps))
+    places = places if len(places) else feet.reshape(-1, 3)
+    eye = truth.T_WC[0, 1, 3] - float(np.median(height(places[:, [0, 2]])))
+    motion = upright(truth.T_WC, UP)
+    joints = truth.joints @ motion[:3, :3].T + motion[:3, 3]
+    return joints + eye * UP, eye
 
 
 def _claimed_there(result: Result, present: np.ndarray) -> Float[np.ndarray, "f 24"]:
@@ -321,7 +380,9 @@ def write_calibration(out: Path, rows: list[Row], *, about: str) -> list[Path]:
         "(`experiments/calibration.py` has them). Right claims have a root mean square "
         "of 1, 68 % of the errors within one claimed standard deviation and 95 % "
         "within 1.96. Of joints, coverage is that of a normal distribution in three "
-        "coordinates. ± is a standard error. Simulated.",
+        "coordinates, of places on the floor in two. Places are compared in the world "
+        "of the first camera and the floor, without alignment; a clip counts once. ± "
+        "is a standard error. Simulated.",
     )
     columns = [
         Column("claim", "what"),
@@ -348,9 +409,9 @@ def _summaries(rows: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
                 continue
             row: Row = {"what": title, "input": which, "count": len(z)}
             row["rms"] = _with_error(z**2, math.sqrt)
-            for share, (limit, _) in CHI2_QUANTILES.items():
-                if name == "joints":
-                    inside = np.array([r[f"joints_within_{share}"] for r in own])
+            for share, (limit, *_) in CHI2_QUANTILES.items():
+                if name in OVER_FRAMES:
+                    inside = np.array([r[f"{name}_within_{share}"] for r in own])
                 elif name == "up":
                     # Two coordinates: χ² with two degrees of freedom.
                     inside = 2 * z**2 < -2 * math.log(1 - share / 100)

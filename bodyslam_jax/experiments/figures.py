@@ -33,7 +33,7 @@ def _figure(width: float, height: float):
     return Figure((width, height), layout="constrained")
 
 
-def _legend(figure, axes, title: str, columns: int = 3, where: str = "upper center"):
+def _legend(figure, axes, title: str, columns: int = 3):
     """Adds one legend for all `axes`, outside them."""
     entries = {}
     for axis in axes:
@@ -46,7 +46,7 @@ def _legend(figure, axes, title: str, columns: int = 3, where: str = "upper cent
         fontsize=8,
         title=title,
         title_fontsize=9,
-        loc=f"outside {where}",
+        loc="outside upper center",
     )
 
 
@@ -242,17 +242,4 @@ def draw_structure(
     axis.set(ylabel="C-ATE, SE(3), mm", yscale="log", ylim=log_limits_mm(drawn))
     axis.set_xticks(np.arange(len(rows)), [str(row["sequence"]) for row in rows])
     _legend(figure, [axis], "simulated", columns=4)
-    _save(figure, path, about)
-
-
-def draw_learning(path: Path, row: Row, about: str) -> None:
-    """Draws the error on the training sequences and the weights after each step."""
-    figure = _figure(9.0, 3.0)
-    left, right = figure.subplots(1, 2)
-    left.plot(np.array(row["history"], float), "o-", color=_ESTIMATE_COLOUR)
-    left.set(xlabel="step", ylabel="training error, 1")
-    for name, values in zip(row["names"], np.array(row["path"], float).T, strict=True):
-        right.plot(values, label=name)
-    right.set(xlabel="step", ylabel="log of the factor on σ")
-    _legend(figure, [right], "simulated", columns=1, where="right upper")
     _save(figure, path, about)

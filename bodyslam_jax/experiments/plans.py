@@ -40,24 +40,12 @@ from bodyslam_jax.experiments.scale import PERTURBATIONS, scale_recovery
 from bodyslam_jax.experiments.scenario import simulations
 from bodyslam_jax.experiments.table1 import FORM, write_table1
 from bodyslam_jax.experiments.video_table import write_video
-from bodyslam_jax.experiments.weights import (
-    Learned,
-    Trial,
-    described,
-    judge,
-    learn_weights,
-    make_trial,
-)
 from bodyslam_jax.pipeline.case import Case
-from bodyslam_jax.pipeline.stage_cache import Cache, body_model_file, fingerprint
+from bodyslam_jax.pipeline.stage_cache import body_model_file
 from bodyslam_jax.simulation import motion_file
 
 ALL_SEQUENCES = ("E1", "E2", "E3", "M1", "M2", "M3", "M4", "D1", "D2", "D3")
 NOISE_LEVELS = ("none", "low", "real")
-LEARNING_STEPS = 12
-DERIVATIVE_COMPILATION_S = 240.0
-"""Processor time of compiling the solver's derivative, which dominates for few and
-short sequences."""
 log = logging.getLogger(__name__)
 
 
@@ -141,8 +129,8 @@ def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
 
 def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Plans the ablations: disabled and added factors, other weights, noise levels,
-    solvers."""
+    """Plans the ablations: disabled factors, other weights and models, noise
+    levels."""
     case = cases(config, stages)
 
     @functools.lru_cache(maxsize=1)
@@ -152,10 +140,10 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
     jobs: list[Job] = []
     begun: set[Simulation] = set()
 
-    def add(settings: Simulation, label: str, compute, solves=1.0, extra=()):
+    def add(settings: Simulation, label: str, compute, extra=()):
         name = named(settings)
         row = lambda: {"sequence": name, "label": label, **compute()}
-        seconds = cost(settings, solves, solves)
+        seconds = cost(settings, 1.0, 1.0)
         if settings in begun:
             seconds -= cost(settings, 0.0, 0.0)  # stages before the solve are cached
         begun.add(settings)
@@ -173,62 +161,12 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
         for file in experiment.motion_models:
             one = lambda s=s, f=file: ablation_.with_motion_model(case(s), f)
             add(s, f"motion model {Path(file).stem}", one, extra=(Path(file),))
-        orders = functools.lru_cache(maxsize=1)(
-            lambda s=s: ablation_.compare_orders(case(s), prepared(s))
-        )
-        for order in ablation_.ORDERS:
-            add(s, order, lambda o=order, f=orders: f()[o], solves=2.0)
         for noise in NOISE_LEVELS:
             quiet = dataclasses.replace(s, noise=noise)
             one = lambda q=quiet: ablation_.ablate(case(q), prepared(q), FULL)
             add(quiet, f"noise: {noise}", one)
     data = about(experiment, config)
     return Plan(jobs, functools.partial(reports.write_ablation, about=data))
-
-
-def weights(experiment: Experiment, config: Config, stages: Path) -> Plan:
-    """Plans the learning of weights on some sequences, and their effect on all
-    sequences.
-
-    Cameras and map are held as bundle adjustment left them, which eliminates landmarks
-    from the problem: only weights of people's factors are learnt.
-    """
-    chosen = simulations(
-        experiment, ("E1", "M1", "M4", "D2", "E2", "M2", "D1"), ("room",)
-    )
-    half = (len(chosen) + 1) // 2
-    training, test = chosen[:half], chosen[half:]
-    key = (tuple(training), config, LEARNING_STEPS)
-    mark = fingerprint(*key)
-    case = cases(config, stages)
-
-    @functools.lru_cache(maxsize=half)
-    def trial(settings: Simulation) -> Trial:
-        prepared = case(settings).prepare()
-        return make_trial(case(settings), prepared, hold_cameras=True)
-
-    @functools.cache
-    def learned() -> Learned:
-        folder = stages / f"weights-{mark}"
-        learn = lambda: learn_weights(
-            [trial(s) for s in training],
-            steps=LEARNING_STEPS,
-            progress=folder / "progress.npz",
-        )
-        return Cache(folder).stage("learned", mark, Learned, learn)
-
-    seconds = DERIVATIVE_COMPILATION_S + sum(cost(s, 8.0, 1.0) for s in training)
-    learnt = lambda: described(learned())
-    jobs = [Job("learnt", key, seconds, learnt, reports.LEARNT_FORM)]
-    for group, settings in (("training", training), ("test", test)):
-        for s in settings:
-            labels = {"sequence": named(s), "set": group}
-            row = lambda s=s, labels=labels: {**labels, **judge(trial(s), learned())}
-            form = {**labels, **reports.JUDGED_FORM}
-            label = f"{group}-{named(s)}"
-            jobs.append(Job(label, (s, *key), cost(s, 2.0, 1.0), row, form))
-    write = functools.partial(reports.write_weights, about=about(experiment, config))
-    return Plan(jobs, write)
 
 
 def video(experiment: Experiment, config: Config, stages: Path) -> Plan:
@@ -250,7 +188,6 @@ PLANS: dict[str, Callable[[Experiment, Config, Path], Plan]] = {
     "landmarks": landmarks,
     "motion": motion_model,
     "ablation": ablation,
-    "weights": weights,
     "video": video,
     "calibration": calibration,
 }
@@ -270,7 +207,8 @@ def run_experiment(
     Rows are cached in `out/rows` under a fingerprint of their inputs, stages before the
     joint estimate in `out/stages`. Tables are written after every row, so that an
     interrupted experiment leaves those of the finished rows. A row that cannot be
-    computed is left out with a warning.
+    computed is left out with a warning. Networks are those that have not been trained
+    on the simulated people (`Config.for_simulated_people`), whatever `config` says.
 
     Args:
         engine: computes the rows elsewhere, in processes that `setup` prepares; `out`
@@ -283,6 +221,7 @@ def run_experiment(
     if name not in PLANS:
         raise InputError(f"no experiment {name!r}; expected one of {sorted(PLANS)}.")
     check_files(experiment, config)
+    config = config.for_simulated_people()
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

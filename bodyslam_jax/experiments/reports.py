@@ -1,4 +1,4 @@
-"""Writes reports of the experiments on scale, landmarks, motion, ablation and weights.
+"""Writes reports of the experiments on scale, landmarks, motion and ablation.
 
 Inputs are finished rows; each report is written as Markdown, CSV and PNG.
 
@@ -27,7 +27,6 @@ from bodyslam_jax.experiments.tables import (
 )
 from bodyslam_jax.pipeline.stage_cache import body_model_file
 
-"""File of the clips that are part of the package."""
 SCALE_FORM = {
     **dict.fromkeys(("perturbation", "scale", "deviation"), [float]),
     **dict.fromkeys(("history", "h_ate"), [[float]]),
@@ -43,16 +42,6 @@ MOTION_FORM = {
     "rows": [{"model": str, "drift": float, "class": str, "error_mm": float}],
     "clips": int,
     "held_out": bool,
-}
-LEARNT_FORM = {
-    "names": [str],
-    "path": [[float]],
-    **dict.fromkeys(("log", "factor", "history"), [float]),
-}
-JUDGED_FORM = {
-    f"{when}/{name}": float
-    for when in ("before", "after")
-    for name in ("error", "scale", "j_ate_se3")
 }
 """Fields, with their types, that cached rows must have for the reports below, as for
 the other forms above (`jobs.fits`)."""
@@ -205,8 +194,8 @@ def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     head = intro(
         "Ablations",
         about,
-        "`seconds` are wall time with compilation, but processor time without it for "
-        "the three rows on orders. `past frames` are those that the motion model sees.",
+        "`seconds` are wall time with compilation. `past frames` are those that the "
+        "motion model sees.",
     )
     files = write_tables(out, "ablation", head, parts, about)
     everything = to_csv([Column("sequence", "sequence"), *columns], rows, about)
@@ -214,55 +203,19 @@ def write_ablation(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     return [*files, *written]
 
 
-def write_weights(out: Path, rows: list[Row], *, about: str) -> list[Path]:
-    """Writes learnt factors, and errors with default and with learnt weights.
-
-    `rows[0]` holds the learnt weights; each further row holds the errors on one
-    training or test sequence.
-    """
-    found, *judged = rows
-    factors = [
-        {"weight": n, "factor": f, "lambda": None if f is None else f**-2}
-        for n, f in zip(found["names"], found["factor"], strict=True)
-    ]
-    columns = [
-        Column("sequence", "sequence"),
-        Column("set", "set"),
-        Column("error before, 1", "before/error", digits=2),
-        Column("after", "after/error", digits=2),
-        Column("scale before", "before/scale", digits=3),
-        Column("scale after", "after/scale", digits=3),
-        Column("J-ATE before, mm", "before/j_ate_se3", MM),
-        Column("J-ATE after, mm", "after/j_ate_se3", MM),
-    ]
-    learnt = [
-        Column("weight", "weight"),
-        Column("factor on σ (or robust scale)", "factor", digits=2, average=False),
-        Column("factor on λ", "lambda", digits=2, average=False),
-    ]
-    head = intro("Weights learnt through the solver", about)
-    parts = [
-        (f"{name} sequences", columns, [r for r in judged if r["set"] == name])
-        for name in ("training", "test")
-    ]
-    parts = [part for part in parts if part[2]]
-    parts.append(("Learnt", learnt, factors))
-    files = write_tables(out, "weights", head, parts, about)
-    write_text(out / "weights.csv", to_csv(columns, judged, about))
-    figures.draw_learning(out / "weights.png", found, about)
-    return [*files, out / "weights.png"]
-
-
 def about(experiment: Experiment, config: Config) -> str:
     """Returns a sentence or two on simulation and settings of the rows of an
     experiment."""
-    first = f"Simulated sequences, noise level `{experiment.noise}`."
+    first = (
+        f"Simulated sequences, noise level `{experiment.noise}`, lifting network "
+        f"`{config.people_fit.lifter}`."
+    )
     return f"{first} {deviations(experiment, config)}".rstrip()
 
 
 def deviations(experiment: Experiment, config: Config) -> str:
     """Returns text on seed, length, motion, models and settings that differ from the
-    defaults.
+    defaults, but for the lifting network, which experiments choose.
 
     Settings are compared with the nearest preset. A body model that is installed on
     this machine counts as named by the user. The text is empty if nothing differs.
@@ -277,7 +230,13 @@ def deviations(experiment: Experiment, config: Config) -> str:
     body = body_model_file(config.body_model)
     config = dataclasses.replace(config, body_model=None if body is None else str(body))
     mine = dict(_flat(config))
-    against = {"default": Config(), "paper": Config.paper()}
+    same = lambda preset: dataclasses.replace(
+        preset,
+        people_fit=dataclasses.replace(
+            preset.people_fit, lifter=config.people_fit.lifter
+        ),
+    )
+    against = {"default": same(Config()), "paper": same(Config.paper())}
     differing = {
         preset: [f"`{k}` {mine[k]}" for k, v in _flat(theirs) if mine[k] != v]
         for preset, theirs in against.items()

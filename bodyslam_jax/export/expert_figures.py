@@ -38,6 +38,7 @@ def people_table(
                 "can be trusted": reported_status(summary, h).status or None,
                 "visible, s": f"{way.seconds:.1f}",
                 "distance from the camera, m": f"{near:.1f} to {far:.1f}",
+                "place on the floor, m": _place(summary, h),
                 "way, m": f"{way.distance:.2f}",
                 "mean speed, m/s": f"{way.mean_speed:.2f}",
                 "stature, cm": f"{100 * statistics.stature(body, result.betas[h]):.1f}"
@@ -64,6 +65,12 @@ def _not_measured(summary: Mapping[str, Any], h: int) -> str | None:
     text."""
     shares = _reported(summary, h).get("not_measured") or {}
     return ", ".join(f"{limb} {100 * x:.0f}" for limb, x in shares.items()) or None
+
+
+def _place(summary: Mapping[str, Any], h: int) -> str | None:
+    """Returns the standard deviation of a person's place on the floor, as text."""
+    sigma = _reported(summary, h).get("place_sigma_m")
+    return None if sigma is None else f"± {sigma:.2f}"
 
 
 def _leg(summary: Mapping[str, Any], h: int) -> str | None:

@@ -107,6 +107,7 @@ def _open(path: Path, flags: int) -> int:
     """Opens a lock file; a symbolic link of this name is not followed."""
     flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
+        # Permissions are what the umask leaves of these.
         file = os.open(path, flags, 0o666)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):

@@ -9,6 +9,7 @@ import numpy as np
 from bodyslam_jax.config import Config
 from bodyslam_jax.diagnostics.accuracy import Accuracy, PersonAccuracy
 from bodyslam_jax.diagnostics.person_verdict import PersonVerdict
+from bodyslam_jax.diagnostics.place_uncertainty import PlaceUncertainty
 from bodyslam_jax.diagnostics.verdict import Verdict
 from bodyslam_jax.ground.gravity import Upright
 from bodyslam_jax.types import (
@@ -58,6 +59,7 @@ def summarise(
         },
         "up": _up(verdict.up, verdict.accuracy),
         "lengths": _lengths(verdict.accuracy),
+        "camera_height": _camera_height(result, verdict.places),
         # What the user gave, and the estimates without it.
         "given": [fact.to_dict() for fact in verdict.given],
         "own": {
@@ -69,9 +71,9 @@ def summarise(
             },
         },
         "people": [
-            _person(person, known)
-            for person, known in zip(
-                verdict.people, verdict.accuracy.people, strict=True
+            _person(person, known) | _place(result, verdict.places, h)
+            for h, (person, known) in enumerate(
+                zip(verdict.people, verdict.accuracy.people, strict=True)
             )
         ],
         # First and last.
@@ -239,6 +241,35 @@ def _person(person: PersonVerdict, sure: PersonAccuracy) -> dict[str, Any]:
             for one in person.seated
         ],
     }
+
+
+def _camera_height(
+    result: Result, places: PlaceUncertainty | None
+) -> dict[str, float | None]:
+    """Returns the height of the first camera above the floor, m, with its standard
+    deviation; `None` without people."""
+    sigma = np.nan if places is None else places.camera_height
+    return {
+        "value_m": float(result.T_WC[0, 1, 3]) if result.present.any() else None,
+        "sigma_m": sigma if np.isfinite(sigma) else None,
+    }
+
+
+def _place(
+    result: Result, places: PlaceUncertainty | None, h: int
+) -> dict[str, float | None]:
+    """Returns the standard deviations of a person's place on the floor and of the
+    height of the pelvis above it, m: root mean squares over the frames with the person;
+    `None` where they are not known."""
+    present = result.present[h]
+    level = height = None
+    if places is not None and present.any():
+        variance = (places.root_sigma[h, present] ** 2).mean(axis=0)
+        level, height = (
+            float(np.sqrt(variance[[0, 2]].sum())),
+            float(variance[1] ** 0.5),
+        )
+    return {"place_sigma_m": level, "height_sigma_m": height}
 
 
 def _cues(start: ScaleStart) -> dict[str, list[float] | None]:

@@ -1,7 +1,12 @@
-"""Operations on arrays: runs of true entries, and sums of rows that share an index."""
+"""Operations on arrays: runs of true entries, sums of rows that share an index, and the
+standard deviation by a median."""
 
 import numpy as np
 from jaxtyping import Bool
+
+SIGMA_OF_MEDIAN = 1.4826
+"""Standard deviation over the median absolute value of normal errors: 1 over the normal
+quantile of 75 %."""
 
 
 def runs(present: Bool[np.ndarray, " t"]) -> list[slice]:

@@ -30,7 +30,9 @@ def exp(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
     half = 0.5 * jnp.sqrt(safe)
     sine, cosine = jnp.sin(half), jnp.cos(half)
     s = squared
+    # Taylor series in s of a,
     a_series = 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72)))
+    # and of b.
     b_series = 0.5 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90))))
     a = jnp.where(small, a_series, sine * cosine / half)
     b = jnp.where(small, b_series, 2 * sine * sine / safe)
@@ -92,6 +94,7 @@ def inverse_right_jacobian(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3
     safe = jnp.where(small, 1.0, squared)
     half = 0.5 * jnp.sqrt(safe)
     factor = (1 - half * jnp.cos(half) / jnp.sin(half)) / safe
+    # Bernoulli numbers: 1 / 12 + s / 720 + ...
     factor = jnp.where(small, 1 / 12 + squared / 720, factor)
     along = (1 - factor * squared)[..., None, None]
     eye = jnp.eye(3, dtype=vector.dtype)
@@ -134,7 +137,9 @@ def _quaternion(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
     s = _squared(vector)
     small = s < _SMALL_SQUARED_ANGLE
     half = 0.5 * jnp.sqrt(jnp.where(small, 1.0, s))
+    # Taylor series of the cosine of half the angle,
     w_series = 1 - s / 8 * (1 - s / 48 * (1 - s / 120))
+    # and of its sine over the angle.
     share_series = 0.5 - s / 48 * (1 - s / 80 * (1 - s / 168))
     w = jnp.where(small, w_series, jnp.cos(half))
     share = jnp.where(small, share_series, 0.5 * jnp.sin(half) / half)

@@ -31,12 +31,8 @@ from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior as MarginalP
 from bodyslam_jax.graph.factors.reprojection import LandmarkPrior as LandmarkPrior
 from bodyslam_jax.graph.factors.reprojection import Reprojection as Reprojection
 from bodyslam_jax.graph.factors.root_orientation import (
-    RelativeOrientation as RelativeOrientation,
-)
-from bodyslam_jax.graph.factors.root_orientation import (
     RootOrientation as RootOrientation,
 )
-from bodyslam_jax.graph.factors.root_orientation import UprightPrior as UprightPrior
 from bodyslam_jax.graph.factors.root_position_prior import (
     RootPositionPrior as RootPositionPrior,
 )

@@ -19,7 +19,6 @@ from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
 from bodyslam_jax.graph.factors.human_motion import HumanMotion
 from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior
 from bodyslam_jax.graph.factors.reprojection import LandmarkPrior, Reprojection
-from bodyslam_jax.graph.factors.root_orientation import RelativeOrientation
 from bodyslam_jax.graph.globals import (
     GlobalPrior,
     Named,
@@ -273,8 +272,6 @@ def _predicted_by(factor: Factor) -> str | None:
         return _predicted_by(factor.factor)
     if isinstance(factor, HumanMotion):
         return "translation"
-    if isinstance(factor, RelativeOrientation):
-        return "rotation"
     if isinstance(factor, BodyPosePrior) and factor.predicted:
         return "body_pose"
     return None

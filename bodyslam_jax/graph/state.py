@@ -156,6 +156,7 @@ def retract_rotation(
     """
     moved = so3.compose(rotation, step)
     squared = jnp.sum(moved**2, axis=-1, keepdims=True)
+    # The 2 rad of the docstring, squared.
     far = squared > 4.0
     angle = jnp.sqrt(jnp.where(far, squared, 1.0))
     flipped = jnp.sum(moved * rotation, axis=-1, keepdims=True) < 0

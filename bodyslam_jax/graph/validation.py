@@ -26,7 +26,7 @@ from bodyslam_jax.graph.factors.ground_contact import GroundContact
 from bodyslam_jax.graph.factors.keypoint_reprojection import KeypointReprojection
 from bodyslam_jax.graph.factors.marginal_prior import MarginalPrior
 from bodyslam_jax.graph.factors.reprojection import LandmarkPrior, Reprojection
-from bodyslam_jax.graph.factors.root_orientation import RootOrientation, UprightPrior
+from bodyslam_jax.graph.factors.root_orientation import RootOrientation
 from bodyslam_jax.graph.factors.root_position_prior import RootPositionPrior
 from bodyslam_jax.graph.layout import Layout
 from bodyslam_jax.graph.ordering import CHUNK
@@ -69,6 +69,7 @@ def check_state(state: State, free: Step | None = None) -> Sizes:
     _check_precision(state, free)
     if not sizes["t"]:
         raise ValueError("state.cameras: 0 frames, expected 1 or more.")
+    # fx fy cx cy, or with the four distortion coefficients of OPENCV.
     if sizes["i"] not in (4, 8):
         raise ValueError(f"state.intrinsics: {sizes['i']} numbers, expected 4 or 8.")
     _check_values(state, "state")
@@ -118,8 +119,6 @@ def check_measurements(factor: Factor, sizes: Sizes) -> None:
         _check_rotations(factor.cameras, f"{name}.cameras", measured)
     if isinstance(factor, GroundContact):
         _check_unit(factor.normal, f"{name}.normal")
-    if isinstance(factor, UprightPrior):
-        _check_unit(factor.up, f"{name}.up")
     if isinstance(factor, RootPositionPrior) and not is_traced(factor.position):
         depth = np.asarray(factor.position)[..., 2][_measured(factor.sigma)]
         if not (depth > 0).all():

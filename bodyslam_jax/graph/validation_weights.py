@@ -13,10 +13,7 @@ from bodyslam_jax.graph.factor import Factor
 from bodyslam_jax.graph.factors.body_pose_prior import BodyPosePrior
 from bodyslam_jax.graph.factors.foot_contact import FootContact
 from bodyslam_jax.graph.factors.human_motion import HumanMotion
-from bodyslam_jax.graph.factors.root_orientation import (
-    RelativeOrientation,
-    RootOrientation,
-)
+from bodyslam_jax.graph.factors.root_orientation import RootOrientation
 from bodyslam_jax.graph.factors.root_position_prior import RootPositionPrior
 from bodyslam_jax.graph.factors.root_smoothness import (
     AngularAccelerationPrior,
@@ -32,7 +29,6 @@ _FIRST_FRAMES = (
     (BodyPosePrior, "correlation", 1, 0.0),
     (RootOrientation, "correlation", 1, 0.0),
     (RootPositionPrior, "correlation", 1, 0.0),
-    (RelativeOrientation, "sigma", 1, np.inf),
     (FootContact, "sigma", 1, np.inf),
     (RootSmoothness, "sigma", 2, np.inf),
     (AngularAccelerationPrior, "sigma", 2, np.inf),

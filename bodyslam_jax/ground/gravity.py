@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.config import GRAVITY_SIGMA
+from bodyslam_jax.geometry.arrays import SIGMA_OF_MEDIAN
 from bodyslam_jax.ground.plane import (
     CAUCHY_SCALE,
     Plane,
@@ -213,7 +214,7 @@ def _trunks(cues: GravityCues) -> tuple[np.ndarray, np.ndarray] | None:
         mean = np.median(tilt, axis=0)
         # Postures are correlated in time: about one independent sample a second.
         seconds = max(1.0, len(own) / cues.fps)
-        scatter = 1.4826 * np.median(np.abs(tilt - mean), axis=0).max()
+        scatter = SIGMA_OF_MEDIAN * np.median(np.abs(tilt - mean), axis=0).max()
         view = (cues.feet[h, frames].mean(axis=1) - cues.eyes[frames])[:, [0, 2]]
         length = np.linalg.norm(view, axis=1, keepdims=True)
         view = view / np.maximum(length, 1e-9)

@@ -116,6 +116,7 @@ def wander(
             slow[h] = np.where(frames, median, 0.0)
     if not used.any():
         return slow, 0.0
+    # One standard deviation either way, of a normal distribution.
     low, high = np.quantile(slow[used], [0.16, 0.84])
     variance = ((high - low) / 2) ** 2
     excess = max(variance - _WANDER_SIGMA_M**2, 0.0)
@@ -150,4 +151,5 @@ def elevation(
     # `wander` reduces heights by the probability p that they are errors; these two
     # cases differ by the mean height, with the variance p (1 - p) of that.
     either = above[used].mean() * _WANDER_SIGMA_M / spread
+    # √3 / 2, as above; `beyond` is r / n.
     return above, float(np.hypot(beyond * np.sqrt(0.75), either))

@@ -10,6 +10,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
+from bodyslam_jax.geometry.arrays import SIGMA_OF_MEDIAN
+
 _MIN_LEVEL_COSINE = np.cos(np.radians(20.0))
 """Cosine of the largest angle between the ground's normal and the assumed up direction,
 which is only known from people's trunks."""
@@ -17,6 +19,8 @@ _MAX_PLANE_DISTANCE = 0.05
 """Inlier distance from the plane, as a share of the camera's height above it."""
 _MAX_SHARE_BELOW = 0.15
 """Largest share of points below the ground: under the plane of a table lie more."""
+_MIN_PLANE_POINTS = 30
+"""Least number of points of a plane; chosen, its effect was not measured."""
 _RANSAC_SAMPLES = 1000
 """Number of planes through three random points that RANSAC evaluates."""
 _DEGREE = np.pi / 180
@@ -54,10 +58,10 @@ def find_ground(
     """
     level = np.median(eyes @ up)
     below = points[points @ up < level]
-    if len(below) < 30:
+    if len(below) < _MIN_PLANE_POINTS:
         return None
     rng = np.random.default_rng(0)
-    best, most = None, max(30, 0.15 * len(points))
+    best, most = None, max(_MIN_PLANE_POINTS, 0.15 * len(points))
     for _ in range(_RANSAC_SAMPLES):
         a, b, c = below[rng.choice(len(below), 3, replace=False)]
         plane = _plane(np.cross(b - a, c - a), a, up)
@@ -142,7 +146,7 @@ def feet_plane(
     information, solution = fit(np.full(len(x), (5 * _MIN_HEIGHT_SIGMA_M) ** -2))
     for _ in range(19):
         residual = x[:, 1] - design @ solution
-        spread = 1.4826 * np.median(np.abs(residual))
+        spread = SIGMA_OF_MEDIAN * np.median(np.abs(residual))
         sigma = max(_MIN_HEIGHT_SIGMA_M, spread * np.sqrt(len(x) / max(len(x) - 3, 1)))
         cauchy = 1 / (1 + (residual / (CAUCHY_SCALE * sigma)) ** 2)
         information, solution = fit(cauchy / sigma**2)
@@ -175,7 +179,7 @@ def _variance_factor(
 ) -> float:
     """Returns the factor by which first-order autoregressive errors enlarge the
     variance of a mean; 1 without positive autocorrelation."""
-    spread = 1.4826 * np.median(np.abs(residual))
+    spread = SIGMA_OF_MEDIAN * np.median(np.abs(residual))
     r = np.clip(residual, -3 * spread, 3 * spread)
     same = people[1:] == people[:-1]
     if same.sum() < 4 or not spread:
@@ -210,7 +214,7 @@ def map_plane(
             return None
         excess = max(_scatter_of_level(away) ** 2 - _MAX_HEIGHT_SCATTER_M**2, 0.0)
     away = landmarks @ normal + offset
-    near = np.abs(away) < 0.05 * height
+    near = np.abs(away) < _MAX_PLANE_DISTANCE * height
     flat = landmarks[near][:, [0, 2]]
     flat = flat - flat.mean(axis=0)
     # Errors of neighbouring points are correlated: ten count as one.
@@ -231,6 +235,7 @@ def _scatter_of_level(heights: Float[np.ndarray, " n"]) -> float:
     ordered = np.sort(heights)
     count = max(1, round(0.4 * len(ordered)))
     length = ordered[count - 1 :] - ordered[: len(ordered) - count + 1]
+    # 0.524: the normal quantile of 70 %, as above.
     return float(length.min()) / 2 / 0.524
 
 

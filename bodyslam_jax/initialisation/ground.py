@@ -191,6 +191,7 @@ def _range(values: Float[np.ndarray, " n"]) -> float:
 
 def _spread(heights: Float[np.ndarray, " n"]) -> float:
     """Returns the standard deviation about zero, from the quantiles of 5 and 95 %."""
+    # The normal quantile of 95 %.
     return float(np.abs(np.quantile(heights, [0.05, 0.95])).max() / 1.645)
 
 

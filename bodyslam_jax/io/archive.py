@@ -152,8 +152,10 @@ def _npy_header(
     path: Path, name: str, file: Any
 ) -> tuple[tuple[int, ...], np.dtype, bool, int]:
     """Returns shape, type, whether columns come first, and the header's own bytes."""
+    # Six letters and the version of NumPy's format,
     magic = file.read(8)
     with reading(path, f"`{name}` in NumPy's format"):
+        # eight bytes in all.
         if len(magic) < 8 or magic[:6] != b"\x93NUMPY" or magic[6] not in (1, 2, 3):
             raise ValueError(f"`{name}` begins with {magic!r}")
         width = 2 if magic[6] == 1 else 4
@@ -167,12 +169,14 @@ def _npy_header(
         entries = dict(_ENTRY.findall(match[1]))
         digits = re.findall(r"\d+", entries["shape"])
         shape = tuple(int(n) for n in digits if len(n) <= _MAX_DIGITS)
+        # NumPy has 32 axes at most.
         if len(shape) != len(digits) or len(shape) > 32:
             raise ValueError(f"`{name}` has the shape {entries['shape'][:80]}")
         return (
             shape,
             _plain_dtype(entries["descr"]),
             entries["fortran_order"] == "True",
+            # Bytes before the content: magic, length, text.
             8 + width + length,
         )
 

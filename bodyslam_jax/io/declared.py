@@ -59,6 +59,7 @@ def as_array(
         return array.astype(bool)
     if array.dtype.kind == "b" and not isinstance(value, np.ndarray):
         raise InputError(f"{path}: `{name}` is true or false, expected numbers.")
+    # A float64 has 8 bytes.
     budget.check_bytes(path, 8 * array.size, f"`{name}` as numbers has ")
     with np.errstate(all="ignore"):
         found = np.asarray(array, np.float64)

@@ -42,9 +42,11 @@ def exif_focal_35mm(path: Path) -> float | None:
     try:
         with open_binary(path, "an image") as file, reading(path, "an image"):
             with _header(file) as opened:
+                # EXIF's own tags, and FocalLengthIn35mmFilm (Exif 2.2).
                 found = float(opened.getexif().get_ifd(0x8769).get(0xA405) or 0)
     except InputError:  # what no one needs must not stop a run
         return None
+    # Lenses that exist; others are errors of the file.
     return found if 5 <= found <= 500 else None
 
 
@@ -73,6 +75,7 @@ def _is_whole_png(data: bytes) -> bool:
     """Returns True if the chunks of a PNG lie within it: OpenCV would allocate what one
     claims to have, up to 2 GB."""
     at = len(_PNG)
+    # A box has a head of 8 bytes.
     while at + 8 <= len(data):
         at += 12 + int.from_bytes(data[at : at + 4], "big")
         if data[at - 8 : at - 4] == b"IEND":

@@ -246,6 +246,7 @@ def _outside(_: Machine) -> None:
 
 def _protocol(machine: Machine) -> None:
     (version,) = machine.bytes_at(1)
+    # The last protocol of Python.
     if version > 5:
         raise Refused(f"a pickle of protocol {version}, expected 0 to 5")
 

@@ -378,6 +378,7 @@ class Machine:
 
     def _array(self, state: Any) -> Any:
         """Returns what `numpy.ndarray.__setstate__` would make."""
+        # With or without a version before shape, type, order and content.
         if type(state) is not tuple or len(state) not in (4, 5):
             raise Refused("an array without shape, type and content")
         shape, of, by_column, content = state[-4:]
@@ -434,6 +435,7 @@ def set_type(of: ArrayType, state: Any) -> None:
 
     The state is (version, order, subtype, names, fields, item size, alignment, flags).
     """
+    # As the docstring says, or with metadata.
     if type(state) is not tuple or len(state) not in (8, 9):
         raise Refused("an array's type with an unknown state")
     version, order, subtype, names, fields, size, alignment, flags, *metadata = state
@@ -444,6 +446,7 @@ def set_type(of: ArrayType, state: Any) -> None:
         and metadata in ([], [None])
         and size in (-1, of.size)
         and alignment in (-1, 1, 2, 4, 8)
+        # NumPy's flags of types of objects and of text.
         and flags in {"O": (63,), "U": (8, 0)}.get(of.kind, (0,))
     )
     if not known:

@@ -35,6 +35,7 @@ _SIZES = {
     "f": (2, 4, 8),
     "c": (8, 16),
 }
+"""Sizes, bytes, of NumPy's types of plain numbers, by kind."""
 _TYPE = re.compile(r"([<>|=]?)([biufcSUO])(\d{0,6})")
 
 
@@ -186,6 +187,7 @@ def array_of(
         raise Damaged("true and false as a number above 1")
     if of.kind == "U":
         points = np.frombuffer(content, f"{of.order}u4")
+        # The last code point, and those of halves of characters in UTF-16.
         if ((points > 0x10FFFF) | ((points >= 0xD800) & (points < 0xE000))).any():
             raise Damaged("a text with characters that Unicode does not have")
     array = array.reshape(shape, order="F" if by_column else "C")
@@ -229,7 +231,9 @@ def read_header(file: Any) -> tuple[ArrayType, tuple[int, ...], bool, int]:
     **Raises:** `Damaged` if it is none; `Refused` for other types than numbers, text
     and objects.
     """
+    # Six letters and the version of NumPy's format,
     magic = file.read(8)
+    # eight bytes in all.
     if magic[:6] != b"\x93NUMPY" or len(magic) < 8 or magic[6] not in (1, 2, 3):
         raise Damaged(f"an array that begins with {magic!r}")
     width = 2 if magic[6] == 1 else 4
@@ -245,12 +249,14 @@ def read_header(file: Any) -> tuple[ArrayType, tuple[int, ...], bool, int]:
         # The place where a type with named fields stands, or a type within a type.
         raise Refused(f"an array with the head {shown(text.strip())}")
     digits = re.findall(r"\d+", found["shape"][0])
+    # Numbers of 18 digits fit 64 bits.
     if any(len(n) > 18 for n in digits):
         raise Refused(f"an array of shape ({shown(found['shape'][0])})")
     return (
         array_type(found["descr"][0]),
         shape_of(tuple(int(n) for n in digits)),
         found["fortran_order"][0] == "True",
+        # Bytes before the content: magic, length, text.
         8 + width + length,
     )
 

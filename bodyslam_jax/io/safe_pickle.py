@@ -63,6 +63,7 @@ def restricted_load(
             size = os.fstat(file.fileno()).st_size
             account = Account(size)
             account.check(size, "a file")
+            # The longest of the signatures below has fewer.
             head = file.read(16)
             file.seek(0)
             if head.startswith(b"PK\x03\x04"):
@@ -112,6 +113,7 @@ def _unpacked(file: Any, head: bytes, account: Account) -> bytes | bytearray:
     compressed with."""
     unpackers = {
         b"x": zlib.decompressobj,
+        # 16 asks zlib for the head of gzip.
         b"\x1f\x8b": lambda: zlib.decompressobj(zlib.MAX_WBITS | 16),
         b"BZh": bz2.BZ2Decompressor,
         b"\xfd7zXZ": lambda: lzma.LZMADecompressor(memlimit=_LZMA_BYTES),
@@ -258,6 +260,7 @@ class _Torch:
 
     def storage(self, pid: Any) -> Storage:
         """Returns the storage that a reference of the pickle names."""
+        # "storage", type, key, place, number (`torch.save`).
         if type(pid) is not tuple or len(pid) != 5 or pid[0] != "storage":
             raise Refused("it refers to data outside the file")
         _, kind, key, _, count = pid

@@ -18,6 +18,7 @@ from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.online.bodies import LiveBodies
 from bodyslam_jax.online.estimate import World
+from bodyslam_jax.online.loops import Correction, Loops
 from bodyslam_jax.online.record import Counts, Record, Seen
 from bodyslam_jax.online.slots import Slots
 from bodyslam_jax.online.window import Solved, Window
@@ -99,7 +100,7 @@ class Maps:
         self.stride = max(1, round(fps / _MAX_WINDOW_RATE))
         self.step = self.stride / fps
         self.pool = ThreadPoolExecutor(1) if threads else None
-        self.job: Future[list[Solved]] | None = None
+        self.job: Future[tuple[list[Solved], Correction | None]] | None = None
         self.now = self.submitted = self.rested = -np.inf
         """Times of the frame that is processed, of that with which the window began,
         and from which it may begin again, s."""
@@ -147,6 +148,8 @@ class Maps:
         """Counts a new map, and resets what belongs to one."""
         self.number += 1
         self.slots = Slots(self.step, self.origin)
+        assert self.intrinsics is not None
+        self.loops = Loops(self.intrinsics)
         self.lost_since: float | None = None
         self.last_place = -np.inf
         self.solved: Solved | None = None
@@ -162,7 +165,6 @@ class Maps:
         self.warnings[TWO_MAPS] = None
         self._end_map()
         self.window.restart()
-        self.follower.places.clear()
         assert self.intrinsics is not None
         self._no_map(self.intrinsics)
 
@@ -218,7 +220,6 @@ class Maps:
                 line += "; or it turned, and the guessed focal length is wrong"
             self.warnings[line] = None
         self.window.restart()
-        self.follower.places.clear()
         self._next_map()
 
     def _forget_fixed(self) -> None:
@@ -306,7 +307,10 @@ class Maps:
         self.lost_since = None
         self._take(row)
         if gray is not None and timestamp - self.last_place >= _KEYFRAME_INTERVAL_S:
-            self.follower.remember(self.map.points)
+            place = self.follower.describe(self.map.points, T_WC)
+            if place is not None:
+                last = self.record.frames[-1]
+                self.loops.add(place, timestamp, last.slot, last.since, T_WC)
             self.last_place = timestamp
         if isinstance(self.map, TurningCamera):
             self.record.fixed[self.number] = self.map.kind
@@ -330,10 +334,11 @@ class Maps:
             return None
         if self.counts.frames % _RELOCALISATION_INTERVAL:
             return None
-        found = self.follower.recognise(gray)
+        found = self.follower.recognise(gray, self.loops.places)
         if found is None:
             return None
-        points, uv = found
+        place, points, uv = found
+        points = self.loops.placed(place, points)
         T_WC = self.map.relocated(points, uv)
         if T_WC is None:
             return None
@@ -383,24 +388,36 @@ class Maps:
         frames = [measured for _, measured in self.slots.pop(count)]
         self.submitted = self.now
         if self.pool is not None:
-            self.job = self.pool.submit(self.window.advance, frames)
+            self.job = self.pool.submit(self._advance, frames)
         else:
             self.job = Future()
-            self.job.set_result(self.window.advance(frames))
+            self.job.set_result(self._advance(frames))
             self._collect(wait=True)
 
+    def _advance(
+        self, frames: list[Measured]
+    ) -> tuple[list[Solved], Correction | None]:
+        windows = self.window.advance(frames)
+        return windows, self.loops.close(windows)
+
     def _collect(self, wait: bool) -> None:
-        """Takes over the solution of the window, if it is ready."""
+        """Takes over the solution of the window, and of the loops, if it is ready."""
         if self.job is None or not (wait or self.job.done()):
             return
-        windows = self.job.result()
+        windows, correction = self.job.result()
         self.job = None
         if np.isfinite(windows[-1].scale_sigma):
             took = self.now - self.submitted
             self.rested = self.now + min(took, _MAX_REST_S)
+        unit = self.loops.correction.unit
+        if correction is not None:
+            self.loops.correction = correction
+            self.record.corrections[self.number] = correction
+            self.window.follow(correction.unit / unit)
         for solved in windows:
-            self.record.keep(self.number, solved)
-            self.world.learn(solved, self.body)
+            self.solved = self.loops.correction.of(solved, unit)
+            self.record.keep(self.number, solved, self.solved)
+            self.world.learn(self.solved, self.body)
             for name, value in solved.seconds.items():
                 self.seconds[name] = self.seconds.get(name, 0.0) + value
         solved = windows[-1]
@@ -413,13 +430,10 @@ class Maps:
             move[:3, :3] = so3.nearest(move[:3, :3])
             self.map.corrected(move, solved.landmarks)
             self.slots.move(move)
-            places = [p.moved(move) for p in self.follower.places]
-            self.follower.places = deque(places, maxlen=self.follower.places.maxlen)
             self.map.forget(self.follower.ids)
         # A window that comes later begins no earlier.
         self.slots.forget(first + CHUNK)
         self.bodies.learn(solved, self.record.shapes)
-        self.solved = solved
 
     def _end_map(self) -> None:
         """Solves all waiting frames."""

@@ -294,7 +294,7 @@ class Online(Maps):
         status: str,
         bodies: dict[int, tuple[np.ndarray, np.ndarray]],
     ) -> Estimate:
-        T_WC = self.world.camera(self.map.T_WC)
+        T_WC = self.world.camera(self.loops.correction.now(self.map.T_WC))
         people: list[PersonEstimate] = []
         for person, (T_CH, pose) in sorted(bodies.items()):
             given = T_CH, pose, self._shape(person), self.body

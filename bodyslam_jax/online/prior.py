@@ -94,6 +94,19 @@ def with_walk_of_scale(
     )
 
 
+def with_drift_of_scale(
+    prior: graph.MarginalPrior, ratio: float
+) -> graph.MarginalPrior:
+    """Returns the prior after s has been multiplied by a known ratio, as the map's unit
+    became longer by it while the map stayed as it is."""
+    root = np.array(prior.root)
+    root[:, 0] /= ratio
+    dtype = prior.estimate.scale.dtype
+    scale = put(np.asarray(prior.estimate.scale, dtype) * np.asarray(ratio, dtype))
+    estimate = dataclasses.replace(prior.estimate, scale=scale)
+    return dataclasses.replace(prior, root=put(root), estimate=estimate)
+
+
 def without_person(prior: graph.MarginalPrior, h: int) -> graph.MarginalPrior:
     """Returns the prior with the coordinates of person `h` marginalised: it has no
     information on the next person in that slot."""

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.graph import CHUNK
+from bodyslam_jax.online.loops import NO_CORRECTION, Correction
 from bodyslam_jax.online.window import SCALE_WALK, Solved
 from bodyslam_jax.online.window_content import Measured, between
 from bodyslam_jax.types import (
@@ -122,11 +123,13 @@ class Record:
         """By map that continues another one, whose camera began to move: map and slot
         of a frame of the other one, and the pose of the first camera relative to that
         frame's, m."""
+        self.corrections: dict[int, Correction] = {}
+        """By map: the drift that loops told."""
         self.pixel_sigma = 0.7
 
-    def keep(self, number: int, solved: Solved) -> None:
+    def keep(self, number: int, solved: Solved, corrected: Solved) -> None:
         """Keeps the frames of a window of map `number`; they replace those of an
-        earlier window."""
+        earlier window. s is that of the map without drift (`corrected`)."""
         first = solved.first
         # Copies: a row of an array would keep all of it.
         for k in range(CHUNK, len(solved.times)):
@@ -149,8 +152,8 @@ class Record:
             if person is not None and solved.present[h].any():
                 self.shapes[person] = solved.shapes[h]
                 self.shape_covariances[person] = solved.shape_covariance[h]
-        sigma = float("nan") if solved.fixed else solved.scale_sigma
-        told = first + len(solved.times) - 1, solved.scale, sigma
+        sigma = float("nan") if solved.fixed else corrected.scale_sigma
+        told = first + len(solved.times) - 1, corrected.scale, sigma
         self.scales.setdefault(number, []).append(told)
         for track, place in solved.landmarks.items():
             if len(self.landmarks) < _MAX_LANDMARKS:
@@ -197,7 +200,7 @@ class _Path:
     T_WC: dict[tuple[int, int], Float[np.ndarray, "4 4"]]
     """Camera poses by map and frame of the window, m."""
     scale: dict[tuple[int, int], float]
-    """m per map unit, by map and frame of the window."""
+    """m per map unit, by map and frame of the window, as the window had it there."""
 
 
 def smoothed_scales(
@@ -332,6 +335,8 @@ def _path(record: Record, fps: float) -> _Path:
         T = np.array([x.T_WC for x in found])
         if known.any():
             T = between(np.array(slots)[known], T[known], np.array(slots))
+        loops = record.corrections.get(number, NO_CORRECTION)
+        T, unit = loops.at(np.array(slots), T)
         steps = np.diff(T[:, :3, 3], axis=0) * s[1:, None]
         T[:, :3, 3] = T[0, :3, 3] * s[0] + np.concatenate(
             [np.zeros((1, 3)), np.cumsum(steps, axis=0)]
@@ -339,7 +344,7 @@ def _path(record: Record, fps: float) -> _Path:
         before, since = record.joins.get(number, ((number, 0), np.eye(4)))
         start = poses[before] @ since if before in poses else end
         into = start @ np.linalg.inv(T[0])
-        for k, pose, value in zip(slots, T, s, strict=True):
+        for k, pose, value in zip(slots, T, s * unit, strict=True):
             poses[number, k] = into @ pose
             scale_at[number, k] = float(value)
         end = poses[number, slots[-1]]

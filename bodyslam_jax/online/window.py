@@ -30,9 +30,10 @@ from bodyslam_jax.pipeline.motion_prediction import contact_probability
 
 _NUM_FIRST_STEPS, _NUM_STEPS = 15, 4
 """Steps of a window's solve: of the first one with a scale, and of all others."""
-SCALE_WALK = 0.005
-"""Relative standard deviation by which the unit of the map changes in a second: what a
-monocular map drifts by on simulated tracks (`benchmarks/online.md`)."""
+SCALE_WALK = 0.015
+"""Relative standard deviation by which the unit of the map changes in a second: the
+drift that is measured in a minute of a rendered room, 12 %, over the root of its
+seconds (`benchmarks/online.md`)."""
 _MIN_OBSERVATIONS = 100
 """Least number of observations from which the noise of the tracks is estimated."""
 
@@ -101,13 +102,31 @@ class Window(Content):
                     clock = _Clock()
                 self._move_on()
                 clock("marginalise")
+            self._follow()
             self._take(frames[start : start + CHUNK])
         return [*solved, self._solve(clock)]
+
+    def follow(self, ratio: float) -> None:
+        """Lets s follow a drift of the map's unit that a loop told: the unit became so
+        many times as long as the window knew."""
+        self.drift *= ratio
+
+    def _follow(self) -> None:
+        if self.drift == 1.0:
+            return
+        self.scale *= self.drift
+        self.scale_sigma *= self.drift
+        if self.prior is not None:
+            self.prior = priors.with_drift_of_scale(self.prior, self.drift)
+        self.drift = 1.0
+        # The last problem is of the unit before: it is solved before frames leave.
+        self.solved_until = self.first
 
     def skip(self, frames: int) -> None:
         """Resumes after a gap of so many frames, in the same map: cameras, landmarks
         and postures of the gap are unknown, people and s are kept."""
         self.prior = None
+        self._follow()
         people, fixed = list(self.people), self.fixed
         told = self.steps_told, self.ground_told, self.pixel_sigma
         at = self.first + self.count + frames

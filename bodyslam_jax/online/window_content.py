@@ -103,6 +103,9 @@ class Content:
         """True if the camera stands still or only turns: its poses are held, there are
         no landmarks, and the scale is determined by people's sizes alone."""
         self.scale, self.scale_sigma = 1.0, float("nan")
+        self.drift = 1.0
+        """Ratio by which the map's unit became longer, as loops told, that s has not
+        followed yet."""
         self.size_sigma = float("nan")
         """Relative standard deviation of people's sizes where `fixed`; NaN as long as
         it is unknown."""

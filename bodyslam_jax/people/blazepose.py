@@ -74,6 +74,7 @@ def turned_square(points: Float[np.ndarray, "17 3"], least: float) -> Square | N
         least: score from which keypoints are used.
     """
     visible = points[:, 2] > least
+    # Rows of COCO's layout.
     shoulders, hips = slice(5, 7), slice(11, 13)
     if not (visible[hips].all() and visible[shoulders].all()):
         return None

@@ -15,6 +15,7 @@ from scipy.linalg import solveh_banded
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import PeopleFit
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.arrays import SIGMA_OF_MEDIAN
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.geometry.lengths import padded_length
 from bodyslam_jax.geometry.whittaker import curvature_bands
@@ -106,8 +107,7 @@ def _shape_gain(bodies: Bodies, settings: PeopleFit) -> float:
 
 def _spread(values: np.ndarray) -> float:
     """Returns the standard deviation about zero, robustly from the median."""
-    # A normal error has a median absolute value of 1 / 1.4826 standard deviations.
-    return 1.4826 * float(np.median(np.abs(values)))
+    return SIGMA_OF_MEDIAN * float(np.median(np.abs(values)))
 
 
 def _place_person(

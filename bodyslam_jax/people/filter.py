@@ -30,6 +30,7 @@ from bodyslam_jax.people.keypoint_errors import (
     pixels_per_metre,
 )
 from bodyslam_jax.people.lift import (
+    ASSETS,
     NUM_SIDE_FRAMES,
     SPACING_S,
     Lifter,
@@ -99,6 +100,7 @@ class PersonFilter:
     ) -> None:
         self.intrinsics, self.fps = intrinsics, fps
         self.scene = make_scene(intrinsics, body, fps, settings, definition)
+        self.lifter = load_lifter(ASSETS[settings.lifter])
         self.recent: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
         self.belief: Belief | None = None
         self.time = 0.0
@@ -184,7 +186,7 @@ class PersonFilter:
         belief = self.belief or _blank(self.scene)
         self.belief = _updated(
             self.scene,
-            load_lifter(),
+            self.lifter,
             belief,
             jnp.asarray(first),
             number(gap),

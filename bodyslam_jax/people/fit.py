@@ -32,7 +32,7 @@ from bodyslam_jax.people.keypoint_errors import (
     keypoint_sigma,
     pixels_per_metre,
 )
-from bodyslam_jax.people.lift import lift, load_lifter
+from bodyslam_jax.people.lift import ASSETS, lift, load_lifter
 from bodyslam_jax.people.person_state import (
     DEPTH_JITTER_M,
     POSITION_JITTER_M,
@@ -166,7 +166,7 @@ def _fit_person(
     where = np.flatnonzero(present)
     fitted = slice(where[0], where[-1] + 1)
     uv, sigma = uv[fitted], sigma[fitted]
-    lifted = guess_postures(scene, uv, sigma, fps, settings.lift_scale > 0, least)
+    lifted = guess_postures(scene, uv, sigma, fps, settings, least)
     sigma_px = in_pixels(sigma, pixels_per_metre(uv, sigma, fps))
     usable = np.flatnonzero(has_enough(sigma))
     start, cuts = _start(scene, uv, sigma_px, usable, lifted, fps)
@@ -207,21 +207,24 @@ def guess_postures(
     uv: Float[np.ndarray, "t 25 2"],
     sigma: Float[np.ndarray, "t 25"],
     fps: float,
-    trusted: bool = True,
+    settings: PeopleFit = PeopleFit(),
     least: int = 0,
 ) -> Lifted:
-    """Returns the lifting network's posture of one person, in C.
+    """Returns the posture of one person that the lifting network of `settings`
+    predicts, in C.
 
     Standard deviations are infinite where it has too few keypoints, and everywhere if
-    not `trusted`.
+    the settings' `lift_scale` is 0.
     """
     dtype = scene.intrinsics.dtype
     length = padded_length(max(len(uv), least)) - len(uv)
     # Beyond the end the last frame is repeated, as the first one is before the start.
     last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
     numbers = (jnp.asarray(a, dtype) for a in (last(uv), last(sigma), fps))
-    lifted, usable = lift(load_lifter(), scene.intrinsics, *numbers)
-    lifted = lifted.widened(jnp.where(usable & trusted, 1.0, jnp.inf).astype(dtype))
+    network = load_lifter(ASSETS[settings.lifter])
+    lifted, usable = lift(network, scene.intrinsics, *numbers)
+    trusted = usable & (settings.lift_scale > 0)
+    lifted = lifted.widened(jnp.where(trusted, 1.0, jnp.inf).astype(dtype))
     return jax.tree.map(lambda a: np.asarray(a)[: len(uv)], lifted)
 
 

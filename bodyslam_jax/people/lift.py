@@ -23,6 +23,9 @@ from bodyslam_jax.io.archive import read_npz
 from bodyslam_jax.people.costs import KEYPOINT_SIGMA, Lifted
 
 ASSET = Path(__file__).parent / "assets" / "lifter.npz"
+HELD_OUT_ASSET = ASSET.with_name("lifter_held_out.npz")
+ASSETS = {"everybody": ASSET, "held-out": HELD_OUT_ASSET}
+"""Files by the setting `PeopleFit.lifter`."""
 SPACING_S = 0.1
 """Time between the network's input frames, s."""
 NUM_SIDE_FRAMES = 5
@@ -88,7 +91,7 @@ def _orthonormal(columns: Float[Array, "*b 6"]) -> Float[Array, "*b 3 3"]:
 
 @functools.cache
 def load_lifter(path: Path = ASSET) -> Lifter:
-    """Returns the network that ships with the package, or another, in float32."""
+    """Returns the network that is used by default, or that of a file, in float32."""
     archive = read_npz(path, "a lifting network (.npz)")
     names = ("first", "hidden", "last", "bias", "last_bias")
     return Lifter(*(jnp.asarray(archive.array(n), jnp.float32) for n in names))

@@ -105,6 +105,7 @@ def simulate_case(
 
     These stages are structure from motion with bundle adjustment on the simulated
     tracks, and the cleaning of the regressed bodies, as in `run`; `build` needs them.
+    Networks are those that have not been trained on the simulated people.
 
     Args:
         sequence: a name from `E1` to `D3`, or all settings.
@@ -127,6 +128,7 @@ def simulate_case(
         sequence = dataclasses.replace(
             sequence, length=frames or sequence.length, **settings
         )
+    config = config.for_simulated_people()
     body = load_body_model(config.body_model)
     simulated = simulation.simulate(sequence, body)
     measured = diagnostics.reconcile(simulation.as_sequence(simulated), body)

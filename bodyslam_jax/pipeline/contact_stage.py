@@ -22,6 +22,7 @@ from bodyslam_jax import graph, initialisation
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.geometry.arrays import SIGMA_OF_MEDIAN
 from bodyslam_jax.ground.heights import wander
 from bodyslam_jax.pipeline.joint_problem import Prepared, solve_stage
 from bodyslam_jax.pipeline.motion_prediction import (
@@ -139,8 +140,9 @@ def stand_on_plane(
         level[group] = np.median(feet) if len(feet) else 0.0
     offset = level + wander(height, used, fps)[0]
     away = np.abs(height - offset)
-    # A normal error has a median absolute value of 1 / 1.4826 standard deviations.
-    spread = max(1.4826 * float(np.median(away[used])) / _MAX_HEIGHT_SCATTER_M, 1.0)
+    spread = max(
+        SIGMA_OF_MEDIAN * float(np.median(away[used])) / _MAX_HEIGHT_SCATTER_M, 1.0
+    )
     near = used & (away < 3 * spread * _MAX_HEIGHT_SCATTER_M)
     # Of a frame of 1/30 s, constant over a stance: variances grow with the rate.
     sigma = _HEIGHT_SIGMA_M * spread * np.sqrt(fps / 30.0)

@@ -27,6 +27,7 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.diagnostics.scale_uncertainty import (
     covariance_sigma,
     inflate_fitted_shapes,
+    leg_variance,
 )
 from bodyslam_jax.ground.vertical_edges import Edges
 from bodyslam_jax.pipeline.contact_stage import hold_standing_feet
@@ -130,6 +131,9 @@ class Uncertainty:
     each."""
     statures: Float[np.ndarray, "h 4"] | None = None
     """Given statures and estimates without them, m, as in `JointEstimate.statures`."""
+    root_covariance: Float[np.ndarray, "h t 3 3"] | None = None
+    """Covariance of pelvis joints in the world, m², as in
+    `JointEstimate.root_covariance`."""
     marginals: solver.Marginals | None = None
     """Marginal covariances; `None` where they were not computed."""
 
@@ -208,6 +212,7 @@ def of_state(
         scale_sigma=uncertainty.scale_sigma,
         shape_covariance=uncertainty.shape_covariance,
         statures=uncertainty.statures,
+        root_covariance=uncertainty.root_covariance,
         unobserved=(
             *prepared.warnings,
             *(f"not well determined: {line}" for line in uncertainty.unobserved),
@@ -243,8 +248,8 @@ def estimate_uncertainty(
     body: BodyModel,
     config: Config,
 ) -> Uncertainty:
-    """Returns the marginal covariances of scale and shapes at the optimum `best`, and
-    the quantities that the measurements do not determine."""
+    """Returns the marginal covariances of scale, shapes and pelvis joints at the
+    optimum `best`, and the quantities that the measurements do not determine."""
     if not config.uncertainty:
         shapes = np.full((len(best.shapes), 10, 10), np.nan)
         return Uncertainty(np.nan, shapes)
@@ -254,11 +259,14 @@ def estimate_uncertainty(
     statures = _statures(prepared, best, np.asarray(shapes), body, config)
     fitted = people.without_bodies(sequence)
     anywhere = np.any(prepared.roots.present, axis=1)
+    hidden = np.zeros(len(anywhere))
     if len(anywhere) and (fitted & anywhere).any():
         sigma = np.where(fitted, config.weights.shape_sigma, 1.0)
         variance, shapes = inflate_fitted_shapes(
             variance, shapes, best.scale, best.shapes, body, sigma, anywhere
         )
+        more = shapes - marginals.shapes
+        hidden = np.asarray(leg_variance(body, best.shapes, more), float)
     # Smoothness of people's motion alone does not measure scale: if the camera follows
     # a person, the path becomes too short (0.57 of the truth, with a sigma of 0.32).
     metric = np.isfinite(prepared.scale.standard_error)
@@ -266,8 +274,36 @@ def estimate_uncertainty(
         float(variance), moving=prepared.moving, metric=bool(metric)
     )
     return Uncertainty(
-        scale_sigma, np.asarray(shapes), tuple(unobserved), statures, marginals
+        scale_sigma,
+        np.asarray(shapes),
+        tuple(unobserved),
+        statures,
+        root_covariance=_root_covariance(prepared, best, marginals, hidden),
+        marginals=marginals,
     )
+
+
+def _root_covariance(
+    prepared: Prepared,
+    best: graph.State,
+    marginals: solver.Marginals,
+    hidden: Float[np.ndarray, " h"],
+) -> Float[np.ndarray, "h t 3 3"] | None:
+    """Returns the covariance of pelvis joints in the world, m²; `None` where it is not
+    finite.
+
+    Args:
+        hidden: relative variance of each person's size that the tightened shape prior
+            hides (`inflate_fitted_shapes`). The scale of the map follows people's size,
+            so that it moves a person along the line from the first camera.
+    """
+    cameras = np.asarray(best.cameras, float)
+    centre = cameras[:, :3, 3] * (float(best.scale) if prepared.moving else 1.0)
+    to = np.einsum("tab,htb->hta", cameras[:, :3, :3], best.roots[..., :3, 3]) + centre
+    more = hidden[:, None, None, None] * to[..., :, None] * to[..., None, :]
+    found = np.asarray(marginals.people, float) + more
+    found = np.where(prepared.roots.present[..., None, None], found, 0.0)
+    return found if np.isfinite(found).all() else None
 
 
 def _statures(

@@ -256,7 +256,12 @@ def assemble(
     result, up = to_metric(sequence, config, body, cameras, joint, edges)
     verdict = diagnostics.assess(sequence, body, cameras, joint, result, up, config)
     summary = summarise(sequence, config, cameras, joint, result, verdict, seconds)
-    return dataclasses.replace(result, summary=summary, joint_sigma=verdict.joint_sigma)
+    return dataclasses.replace(
+        result,
+        summary=summary,
+        joint_sigma=verdict.joint_sigma,
+        root_sigma=None if verdict.places is None else verdict.places.root_sigma,
+    )
 
 
 def _check_length(sequence: Sequence) -> None:

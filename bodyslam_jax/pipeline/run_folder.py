@@ -92,6 +92,7 @@ def demo(
     """Renders a walker filmed by a moving camera and runs the pipeline on the images.
 
     The scene is written to `out/scene`, a sequence folder with its ground truth.
+    Networks are those that have not been trained on the walker.
 
     Args:
         from_pixels: True to detect people in the images, with the networks of the
@@ -99,7 +100,7 @@ def demo(
 
     **Raises:** `ValueError` if `out` cannot be written.
     """
-    config, warnings = with_compatible_body(config)
+    config, warnings = with_compatible_body(config.for_simulated_people())
     cache = Cache(out / ".cache", {"name": _SCENE_FOLDER})
     export.check_folder(out, cache.source, cache.owner())
     with export.locked(out):

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bodyslam_jax.sfm.bundle import Scene
+from bodyslam_jax.sfm.bundle import Scene, errors
 from bodyslam_jax.sfm.multiview import planar_poses, relative_pose, resect
 from bodyslam_jax.sfm.partial_map import Mapper, PartialMap
 from bodyslam_jax.types import CameraPath
@@ -22,6 +22,13 @@ _NUM_FIRST_PAIRS = 4
 noise level, as the best is chosen by its share of inliers."""
 MIN_SHARED_POINTS = 12
 """Least number of points that two related frames share."""
+_MIN_EXPLAINED_SHARE = 0.75
+"""Share of observations that a start explains below which twice the tolerance is
+tried."""
+_MIN_TOLERANCE_GAIN = 0.1
+"""Least share of observations that twice the tolerance explains in addition, and of
+inliers beyond the tolerance, for which it is kept: of normally distributed noise 0.14
+are beyond if its standard deviation is half of the tolerance, 0.01 if it is a third."""
 _NUM_RELAXED_ROUNDS = 3
 """Number of rounds with a smaller parallax threshold where
 cameras cannot be located."""
@@ -83,18 +90,21 @@ class Builder(Mapper):
             pairs: frames, error of a turning camera and common points of each pair of
                 keyframes, as from `rotation_error`.
 
-        Where even the best has many outliers, the noise of the tracks is larger than
-        assumed: it is tried again with twice the tolerance.
+        Where even the best explains few observations, the noise of the tracks may be
+        larger than assumed, or parallax may be short. Twice the tolerance is tried, and
+        kept if many inliers need it: a map with a needless tolerance joins few of the
+        tracks that it could, and wrong ones, and its scale drifts.
         """
         starts = first_pairs(pairs, _NUM_FIRST_PAIRS)
         best, score = self._best_start(keyframes, starts)
         for _ in range(2):
-            if score > 0.75:
+            if score > _MIN_EXPLAINED_SHARE:
                 break
             self.threshold *= 2
             self.pixel *= 2
             wider, wider_score = self._best_start(keyframes, starts[:2])
-            if wider_score < score + 0.1:
+            gain = 0.0 if wider is None else self._share_beyond(wider, 0.5)
+            if min(wider_score - score, gain) < _MIN_TOLERANCE_GAIN:
                 self.threshold /= 2
                 self.pixel /= 2
                 break
@@ -261,6 +271,13 @@ class Builder(Mapper):
     def score(self, grown: PartialMap, frames: np.ndarray) -> float:
         """Returns the share of inliers among the observations in `frames`."""
         return self.share_explained(grown, frames)[0]
+
+    def _share_beyond(self, grown: PartialMap, tolerance: float) -> float:
+        """Returns the share of the inliers whose error is beyond `tolerance`, in
+        thresholds."""
+        inliers = self.views[np.flatnonzero(grown.inlier)]
+        beyond = errors(grown.scene, inliers) > tolerance * self.threshold
+        return float(beyond.mean()) if len(beyond) else 0.0
 
     def share_explained(
         self, grown: PartialMap, frames: np.ndarray

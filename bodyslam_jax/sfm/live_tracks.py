@@ -5,9 +5,9 @@ Lucas--Kanade there and back. ORB (Rublee et al., 2011) describes keyframes, so 
 camera that lost all points can be located again. Memory does not grow.
 """
 
-import dataclasses
 import functools
 from collections import deque
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.features import epipolar_inliers, match, spread
+from bodyslam_jax.sfm.places import MIN_MATCHES, Place
 from bodyslam_jax.types import Intrinsics
 
 _MAX_ROUND_TRIP_PX = 0.5
@@ -33,29 +34,11 @@ _MAX_EPIPOLAR_PX = 1.5
 _MIN_MOTION_PX = 3.0
 """Median motion over these frames, px, below which the epipolar test is not
 informative."""
-_MAX_PLACES = 60
-"""Number of keyframes that are kept: two minutes at one in two seconds."""
 _NUM_FEATURES = 1000
 _MAX_CORNER_DISTANCE_PX = 3.0
 """Largest distance of a tracked point from the corner that describes it, px."""
-_MIN_MATCHES = 20
-"""Least number of matches of a recognised place."""
 _MIN_CONTRAST = 8.0
 """Standard deviation of grey levels below which an image has no features."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Place:
-    """The descriptors of a keyframe, and the positions of its points."""
-
-    descriptors: UInt8[np.ndarray, "n 32"]
-    points: Float[np.ndarray, "n 3"]
-    """Map units."""
-
-    def moved(self, move: Float[np.ndarray, "4 4"]) -> "Place":
-        """Returns the place after a transform of the whole map."""
-        points = self.points @ move[:3, :3].T + move[:3, 3]
-        return dataclasses.replace(self, points=points)
 
 
 class PointFollower:
@@ -72,7 +55,6 @@ class PointFollower:
             maxlen=_RIGID_FRAMES + 1
         )
         self.next_id = 0
-        self.places: deque[Place] = deque(maxlen=_MAX_PLACES)
 
     @property
     def orb(self) -> cv2.ORB:
@@ -105,42 +87,58 @@ class PointFollower:
         self.step = np.concatenate([self.step, np.zeros_like(uv)])
         return ids
 
-    def remember(self, points: dict[int, Float[np.ndarray, " 3"]]) -> None:
-        """Adds the last image as a place, with its points that have a known
-        position."""
+    def describe(
+        self,
+        points: dict[int, Float[np.ndarray, " 3"]],
+        T_WC: Float[np.ndarray, "4 4"],
+    ) -> Place | None:
+        """Returns the last image, whose camera is `T_WC`, as a place, with its corners
+        that have a known position; `None` if there are too few."""
         known = np.array([i in points for i in self.ids.tolist()], bool)
-        if known.sum() < _MIN_MATCHES or self.previous is None:
-            return
+        if known.sum() < MIN_MATCHES or self.previous is None:
+            return None
         marks, descriptors = self.orb.detectAndCompute(self.previous, None)
         if descriptors is None:
-            return
-        # Described are ORB's own corners, turned as it sees them, next to known points.
+            return None
+        # Described are ORB's own corners, turned as it sees them, at the depth of the
+        # known points next to them.
         ids, uv = self.ids[known], self.uv[known]
         corners = np.array([mark.pt for mark in marks])
         found = KDTree(uv).query(corners, distance_upper_bound=_MAX_CORNER_DISTANCE_PX)
         away, near = (np.asarray(x) for x in found)
         rows = np.flatnonzero(np.isfinite(away))
-        if len(rows) < _MIN_MATCHES:
-            return
-        where = np.array([points[i] for i in ids[near[rows]].tolist()])
-        self.places.append(Place(descriptors[rows], where))
+        where = np.array([points[i] for i in ids[near[rows]].tolist()]).reshape(-1, 3)
+        depth = (where - T_WC[:3, 3]) @ T_WC[:3, 2]
+        rows, depth = rows[depth > 0], depth[depth > 0]
+        if len(rows) < MIN_MATCHES:
+            return None
+        xy = rays(corners[rows].astype(float), self.K, self.distortion)
+        p_C = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) * depth[:, None]
+        return Place(descriptors[rows], p_C)
 
     def recognise(
-        self, gray: UInt8[np.ndarray, "y x"]
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2"]] | None:
-        """Returns the points of the place with the most matches, and their pixels in
-        the image."""
+        self, gray: UInt8[np.ndarray, "y x"], places: Iterable[Place]
+    ) -> (
+        tuple[
+            Place,
+            Float[np.ndarray, "n 3"],
+            Float[np.ndarray, "n 2"],
+        ]
+        | None
+    ):
+        """Returns the place with the most matches, their points in the frame of its
+        camera, and their pixels in the image."""
         found, descriptors = self.orb.detectAndCompute(gray, None)
-        if descriptors is None or len(found) < _MIN_MATCHES:
+        if descriptors is None or len(found) < MIN_MATCHES:
             return None
         uv = np.array([p.pt for p in found])
         best = None
-        for place in reversed(self.places):
+        for place in places:
             pairs = match(place.descriptors, descriptors)
-            if len(pairs) >= _MIN_MATCHES and (
-                best is None or len(pairs) > len(best[0])
+            if len(pairs) >= MIN_MATCHES and (
+                best is None or len(pairs) > len(best[1])
             ):
-                best = place.points[pairs[:, 0]], uv[pairs[:, 1]]
+                best = place, place.points[pairs[:, 0]], uv[pairs[:, 1]]
         return best
 
     def _keep(self, kept: np.ndarray) -> None:

@@ -38,6 +38,7 @@ def sequence_folder(out: Path, dataset: str, source: Path) -> Iterator[Path]:
             yield partial
             mark = {"dataset": dataset, "source": str(source.resolve())}
             (partial / _MARKER_FILE).write_text(json.dumps(mark) + "\n")
+            # Readable by everybody, as `mkdir` makes folders.
             partial.chmod(0o755)
             _move(partial, out)
     except OSError as error:
@@ -111,5 +112,6 @@ def write_keypoints(
             for person in people
             if person[k, :, 2].any()
         ]
+        # The version of OpenPose's files.
         text = json.dumps({"version": 1.3, "people": found})
         (keypoints / f"{name}_{k:012d}_keypoints.json").write_text(text)

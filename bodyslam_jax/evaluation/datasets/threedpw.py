@@ -35,6 +35,7 @@ def convert_3dpw(source: Path, out: Path) -> Path:
     detections = None
     if data.get("poses2d") is not None:
         detections = [
+            # OpenPose's COCO layout has 18 points.
             checks.array(source, "poses2d", x, (len(T_CW), 3, 18)).transpose(0, 2, 1)
             for x in checks.entries(source, "poses2d", data["poses2d"], len(people))
         ]

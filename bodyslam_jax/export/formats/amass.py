@@ -15,6 +15,7 @@ from bodyslam_jax.export.formats.scene import Scene, at_constant_rate
 _NUM_BODY_PARAMETERS, _NUM_SMPLH_PARAMETERS = 66, 156
 """Numbers of pose parameters: of SMPL-H's body, and including hands."""
 _NUM_BETAS, _NUM_DMPLS = 16, 8
+"""Numbers of shape and soft-tissue coefficients in AMASS's files."""
 
 
 def write(path: Path, scene: Scene) -> None:

@@ -62,6 +62,7 @@ def write(path: Path, scene: Scene, names: Sequence[str] = MIXAMO_NAMES) -> None
         for child in children:
             joint(child, depth + 1)
         if not children:
+            # Length of the drawn end of a chain: nothing is measured there.
             end = 0.3 * (rest[k] - rest[PARENTS[k]])
             lines.append(f"{indent}  End Site\n{indent}  {{")
             lines.append(f"{indent}    OFFSET {_numbers(end)}\n{indent}  }}")

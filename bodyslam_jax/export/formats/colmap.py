@@ -25,6 +25,7 @@ from bodyslam_jax.geometry import so3_numpy as so3
 _MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4}
 """COLMAP's numbers of camera models."""
 _GREY_LEVEL = 128
+"""Colour of points, of which none is known: the middle of 0 to 255."""
 _MISSING_ERROR_PX = -1.0
 
 

@@ -16,17 +16,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax.body import JOINT_NAMES
-from bodyslam_jax.body.skeleton import NECK, PELVIS
+from bodyslam_jax.body.skeleton import JOINT_NAMES, NECK, PELVIS
 from bodyslam_jax.export.formats.scene import Scene
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.markup import csv_table
 
 SMPL_TO_ISB = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 """Rotation from SMPL's axes (x left, y up, z forward) to x forward, y up, z right."""
-_LEG_JOINTS = {"hip": 1, "knee": 4, "ankle": 7}
+_LEG_JOINTS, _ARM_JOINTS = (
+    {name: JOINT_NAMES.index(f"left_{name}") for name in names}
+    for names in (("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist"))
+)
 """Index of the left joint by name; that of the right one is the next."""
-_ARM_JOINTS = {"shoulder": 16, "elbow": 18, "wrist": 20}
 
 
 def write(path: Path, scene: Scene) -> None:
@@ -40,6 +41,10 @@ def write(path: Path, scene: Scene) -> None:
             columns[f"{name}_{'xyz'[axis]}_m"] = joints[:, k, axis]
         if result.joint_sigma is not None:
             columns[f"{name}_sigma_m"] = result.joint_sigma[0, :, k]
+    if result.root_sigma is not None:
+        for axis in range(3):
+            name = f"{JOINT_NAMES[PELVIS]}_place_{'xyz'[axis]}_sigma_m"
+            columns[name] = result.root_sigma[0, :, axis]
     turns = so3.exp(result.poses[0].reshape(len(joints), 24, 3))
     vertical = np.eye(3)[1 if scene.up == "y" else 2]
     columns |= angles(turns, joints, vertical)
@@ -112,8 +117,8 @@ def speeds(
     They are central differences, NaN where the person is missing in the frame before or
     after.
     """
-    points = {"pelvis": PELVIS, "left_wrist": 20, "right_wrist": 21}
-    points |= {"left_foot": 10, "right_foot": 11}
+    sided = ("left_wrist", "right_wrist", "left_foot", "right_foot")
+    points = {name: JOINT_NAMES.index(name) for name in ("pelvis", *sided)}
     found = {}
     for name, joint in points.items():
         path = np.where(present[:, None], joints[:, joint], np.nan)

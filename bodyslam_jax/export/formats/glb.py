@@ -31,7 +31,9 @@ _MAX_INFLUENCES = 4
 _POINTS_MODE, _LINES_MODE = 0, 1
 """Primitive modes; triangles are the default."""
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+"""Types of accessors by their number of components."""
 _COMPONENTS = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
+"""Codes of the types of components (glTF 2.0, accessors)."""
 VERTICES, INDICES = 34962, 34963
 """Targets of buffer views that hold vertex attributes and indices."""
 _MAGIC, _VERSION, _JSON, _BIN = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
@@ -366,6 +368,7 @@ class Buffer:
         }
         text = json.dumps(document, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
+        # The file's head has 12 bytes, that of each part 8.
         length = 12 + 8 + len(text) + 8 + len(data)
         with path.open("wb") as file:
             file.write(struct.pack("<III", _MAGIC, _VERSION, length))

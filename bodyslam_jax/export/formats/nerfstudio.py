@@ -50,4 +50,5 @@ def write(path: Path, scene: Scene) -> None:
 
 def _intrinsics(params: np.ndarray) -> dict[str, float]:
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+    # As many as `names`: those of OPENCV.
     return dict(zip(names, np.pad(params, (0, 8 - len(params))).tolist(), strict=True))

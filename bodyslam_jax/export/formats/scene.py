@@ -202,8 +202,11 @@ def make_scene(
 def of_people(result: Result, people: Any) -> Result:
     """Returns the result with these people only; `people` is an index of arrays."""
     fields = ["poses", "trans", "betas", "joints", "present"]
-    if result.joint_sigma is not None:
-        fields.append("joint_sigma")
+    fields += [
+        name
+        for name in ("joint_sigma", "root_sigma")
+        if getattr(result, name) is not None
+    ]
     return dataclasses.replace(
         result, **{n: getattr(result, n)[people] for n in fields}
     )
@@ -217,8 +220,12 @@ def turned(result: Result, body: BodyModel, R: Float[np.ndarray, "3 3"]) -> Resu
     pelvis = pelvis.astype(np.float64)[:, None, 0]
     poses = result.poses.copy()
     poses[..., :3] = so3.log(R @ so3.exp(poses[..., :3]))
+    sigma = result.root_sigma
+    # Exact where R exchanges axes; else coordinates are taken to be uncorrelated.
+    sigma = None if sigma is None else np.sqrt(sigma**2 @ (R**2).T)
     return dataclasses.replace(
         result,
+        root_sigma=sigma,
         T_WC=T_WC,
         landmarks=result.landmarks @ R.T,
         poses=poses,
@@ -271,6 +278,7 @@ def at_constant_rate(scene: Scene) -> Scene:
         joints=each(r.joints).reshape(h, num, 24, 3),
         present=there,
         joint_sigma=None,
+        root_sigma=None,
     )
     return dataclasses.replace(scene, result=found)
 

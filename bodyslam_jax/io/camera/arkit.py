@@ -64,6 +64,7 @@ def read_arkit_poses(
         return table[:, 0] - table[0, 0], _poses(path, table[:, 5:], table[:, 2:5])
     data = _metadata(path)
     rows = data.array("poses")
+    # A quaternion and a position.
     if rows.ndim != 2 or rows.shape[1] != 7 or not len(rows):
         raise InputError(
             f"{path}: poses of shape {rows.shape}, expected rows of "

@@ -324,6 +324,7 @@ def as_opencv(params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns camera matrix and distortion coefficients as cv2 expects them."""
     fx, fy, cx, cy = params[:4]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    # PINHOLE has no distortion coefficients, OPENCV has four.
     return K, params[4:] if len(params) == 8 else np.zeros(4)
 
 
@@ -347,4 +348,5 @@ def _focal_from_exif(image: Path, longer_side: float) -> float | None:
     if equivalent is None:
         return None
     _log.info("%s: focal length %g mm (35 mm equivalent).", image.name, equivalent)
+    # Film of 35 mm has frames 36 mm wide.
     return equivalent / 36.0 * longer_side

@@ -215,6 +215,7 @@ def _coefficients(path: Path, values: Any) -> Float[np.ndarray, " d"]:
     if isinstance(values, dict):
         values = fields(path, values, "distortion").value("data")
     found = as_array(path, "distortion", values).ravel()
+    # fx fy cx cy and four distortion coefficients.
     if found.size > 8 and not np.any(found[8:]):
         found = found[:8]
     if found.size not in (0, 1, 2, 4, 5, 8):

@@ -80,6 +80,7 @@ def read_poses(path: Path) -> tuple[list[str], Float[np.ndarray, "n 4 4"]]:
     if not rows:
         raise InputError(f"{path}: no image in it, expected {what}.")
     names, numbers = zip(*rows, strict=True)
+    # A quaternion and a translation.
     numbers = as_array(path, "poses", list(numbers), (None, 7))
     length = np.linalg.norm(numbers[:, :4], axis=1)
     if (abs(length - 1) > 0.05).any():

@@ -248,6 +248,7 @@ def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 
             row = [float(word) for word in words]
         except ValueError:
             row = []
+        # A time, a position and a quaternion.
         if len(row) != 8 or not all(abs(x) <= _MAX_NUMBER for x in row):
             raise InputError(
                 f"{path}, line {number}: {line.strip()[:60]!r}, not eight numbers "

@@ -17,7 +17,7 @@ more, a random one 0 ± 0.4 and at most 1.0; two known orders differ by 0.6 or m
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -89,38 +89,56 @@ _RMS_DISTANCES_M = (0.15, 0.25, 0.35, 0.5, 0.7)
 hidden body has less."""
 _BACKGROUND_WIDTH_M = 0.6
 """Width of the density of points without neighbours, m."""
-_BONES = (  # parts of the right side, of the left side, m
-    ((2, 3), (5, 6), 0.28),
-    ((3, 4), (6, 7), 0.25),
-    ((9, 10), (12, 13), 0.40),
-    ((10, 11), (13, 14), 0.40),
-    ((2, 9), (5, 12), 0.50),
-    ((15, 17), (16, 18), 0.09),
-    ((0, 15), (0, 16), 0.05),
-    ((0, 17), (0, 18), 0.11),
-    ((1, 2), (1, 5), 0.17),
-    ((8, 9), (8, 12), 0.10),
-    ((17, 2), (18, 5), 0.25),
-    ((11, 24), (14, 21), 0.07),
-    ((11, 22), (14, 19), 0.17),
-    ((11, 23), (14, 20), 0.16),
-    ((22, 23), (19, 20), 0.08),
-    ((24, 22), (21, 19), 0.22),
-    ((24, 23), (21, 20), 0.20),
+_DISTANCES_M = (
+    ("shoulder", "elbow", 0.28),
+    ("elbow", "wrist", 0.25),
+    ("hip", "knee", 0.40),
+    ("knee", "ankle", 0.40),
+    ("shoulder", "hip", 0.50),
+    ("eye", "ear", 0.09),
+    ("nose", "eye", 0.05),
+    ("nose", "ear", 0.11),
+    ("neck", "shoulder", 0.17),
+    ("mid_hip", "hip", 0.10),
+    ("ear", "shoulder", 0.25),
+    ("ankle", "heel", 0.07),
+    ("ankle", "big_toe", 0.17),
+    ("ankle", "small_toe", 0.16),
+    ("big_toe", "small_toe", 0.08),
+    ("heel", "big_toe", 0.22),
+    ("heel", "small_toe", 0.20),
+    ("right_shoulder", "left_shoulder", 0.33),
+    ("right_hip", "left_hip", 0.20),
+    ("right_eye", "left_eye", 0.06),
+    ("right_ear", "left_ear", 0.14),
+    ("nose", "neck", 0.22),
+    ("neck", "mid_hip", 0.50),
+    ("head_top", "nose", 0.15),
+    ("head_top", "neck", 0.28),
+    ("spine", "mid_hip", 0.20),
+    ("spine", "neck", 0.30),
 )
-_OTHER_NEIGHBOURS = (
-    ((2, 5), 0.33),
-    ((9, 12), 0.20),
-    ((15, 16), 0.06),
-    ((17, 18), 0.14),
-    ((0, 1), 0.22),
-    ((1, 8), 0.50),
-    ((HEAD_TOP, 0), 0.15),
-    ((HEAD_TOP, 1), 0.28),
-    ((SPINE, 8), 0.20),
-    ((SPINE, 1), 0.30),
-)
-_NEIGHBOURS = [(a, m) for r, l, m in _BONES for a in (r, l)] + list(_OTHER_NEIGHBOURS)
+"""Distances between neighbours on a body, of both sides where no side is named, m:
+those of the default body at rest within 5 cm, which is little beside the width of the
+density."""
+_PARTS = {**BODY25, "head_top": HEAD_TOP, "spine": SPINE}
+_SIDED = {name.partition("_")[2] for name in BODY25 if name.startswith("left_")}
+
+
+def _neighbours() -> Iterator[tuple[tuple[int, int], float]]:
+    """Yields the pairs of parts of `_DISTANCES_M`, right before left, with their
+    distances, m."""
+    for first, second, length in _DISTANCES_M:
+        sided = {first, second} & _SIDED
+        for side in ("right_", "left_") if sided else ("",):
+            a, b = (
+                _PARTS[side + name if name in sided else name]
+                for name in (first, second)
+            )
+            yield (a, b), length
+
+
+_NEIGHBOURS = list(_neighbours())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,12 +19,12 @@ from jaxtyping import Array, Float
 from scipy.optimize import least_squares
 
 from bodyslam_jax.body import PARENTS, BodyModel, rest_joints
+from bodyslam_jax.body.skeleton import ANKLES, HIPS, KNEES, MIRRORED
 from bodyslam_jax.geometry import so3
 
 FPS = 30.0
 """Frame rate of every motion model, 1/s."""
-LEFT_RIGHT = ((1, 2), (4, 5), (7, 8), (10, 11), (13, 14), (16, 17), (18, 19), (20, 21))
-LEFT_RIGHT = (*LEFT_RIGHT, (22, 23))
+LEFT_RIGHT = tuple((k, other) for k, other in enumerate(MIRRORED) if other > k)
 """Pairs of SMPL joints that mirroring swaps."""
 _FITTED_JOINTS = (1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21)
 """Bones, by their lower joint, whose lengths determine the shape."""
@@ -65,8 +65,11 @@ def leg_length(rest: Float[np.ndarray, "*b 24 3"]) -> Float[np.ndarray, "*b"]:
     """Returns the leg length (m) of joints in any pose: hip to knee to ankle, mean of
     both sides."""
     rest = np.asarray(rest)
-    bone = lambda j, i: np.linalg.norm(rest[..., j, :] - rest[..., i, :], axis=-1)
-    return np.asarray((bone(4, 1) + bone(7, 4) + bone(5, 2) + bone(8, 5)) / 2)
+    bones = [*zip(HIPS, KNEES), *zip(KNEES, ANKLES)]
+    lengths = [
+        np.linalg.norm(rest[..., j, :] - rest[..., i, :], axis=-1) for i, j in bones
+    ]
+    return np.asarray(sum(lengths) / 2)
 
 
 def rest_from_offsets(

@@ -58,6 +58,7 @@ def _as_smpl(data: dict) -> dict:
     """Returns the data with SMPL's poses, if they are as wide as SMPL-H's or
     SMPL-X's."""
     poses, betas = (numbers_of(data, name, None) for name in ("poses", "betas"))
+    # Three angles for 22 joints, for SMPL-H's 52, for SMPL-X's 55.
     if poses.ndim != 2 or poses.shape[1] not in (66, 156, 165):
         poses72 = poses
     else:

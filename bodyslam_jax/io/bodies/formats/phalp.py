@@ -29,6 +29,7 @@ class Phalp(BodyFormat):
     def focal(self, camera: Intrinsics) -> float:
         """Returns 5000 px for a crop of 256 px, so 5000/256 of the longer side
         (`EXTRA.FOCAL_LENGTH / MODEL.IMAGE_SIZE * img_size.max()`, `demo.py`)."""
+        # HMR2's focal length for its crop of 256 px.
         return 5000 / 256 * max(camera.width, camera.height)
 
     def read(self, source: Source, video: Video) -> Rows:
