@@ -33,7 +33,13 @@ a test: two processes stay below 4 GB."""
 
 _LONGEST = (
     *("solver", "docs", "online", "marginalisation", "experiments", "toolkit"),
-    *("posture_basis", "frontend_lens", "online_fixed", "motion_training", "evaluation"),
+    *(
+        "posture_basis",
+        "frontend_lens",
+        "online_fixed",
+        "motion_training",
+        "evaluation",
+    ),
     *("camera_evidence", "pipeline", "stack_cases", "given_facts", "contact"),
     *("compilation", "experiments_video", "mixed_precision", "synthetic_writing"),
     *("batch", "motion_coupling", "frontend_motion", "people_floor", "graph"),

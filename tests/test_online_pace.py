@@ -7,6 +7,8 @@ import pytest
 from passing_camera import CAMERA, passing
 
 import bodyslam_jax as bs
+from bodyslam_jax import simulation
+from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.online import maps, online
 from bodyslam_jax.online.record import Record, Seen, Slot, evenly, parts_of
 from bodyslam_jax.online.slots import Slots
@@ -193,3 +195,29 @@ def test_the_networks_look_once_in_a_frame_of_the_window(without_solves, monkeyp
     assert looked == looks
     given = [row.time for _, row in one.slots.waiting]
     assert given and set(given) <= set(looks)
+
+
+@pytest.mark.slow
+def test_few_steps_tell_no_scale():
+    """A scale that began at any value was claimed with three times its own size."""
+    settings = Simulation(sequence="M2", family="follow", length=60)
+    made = simulation.simulate(settings)
+    sequence, truth = simulation.as_sequence(made), simulation.as_truth(made)
+    found, tracks, unit = sequence.keypoints, sequence.tracks, 5.0
+    assert found is not None and tracks is not None
+    window = Window(sequence.intrinsics, bs.load_body_model(), Config(), 10.0, 1)
+    known = {}
+    for count in (8, 20):
+        frames = []
+        for k in range(0, 60, 3):
+            at, T_WC = tracks.frame == k, truth.T_WC[k].copy()
+            T_WC[:3, 3] /= unit
+            rows = found.uv[0, k], found.confidence[0, k][:, None]
+            people = {0: np.concatenate(rows, axis=1)} if k < 3 * count else {}
+            seen = tracks.landmark[at], tracks.uv[at]
+            frames.append(Measured(k / 30, T_WC, True, *seen, people))
+        window.restart()
+        known[count] = window.advance(frames)[-1]
+    assert np.isnan(known[8].scale_sigma)
+    assert known[20].scale == pytest.approx(unit, abs=0.5)
+    assert known[20].scale_sigma < 0.1 * unit

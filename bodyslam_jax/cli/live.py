@@ -120,7 +120,8 @@ def live(
         if capture.dropped:
             online.warn(
                 f"{capture.dropped} of {capture.dropped + len(indices)} frames were "
-                "dropped: newer ones came before they were used"
+                "dropped, as newer ones came before they were used, and are "
+                "interpolated in the result"
             )
         if capture.path is not None:
             online.video, online.picks = capture.path, indices
