@@ -120,7 +120,8 @@ def live(
         if capture.dropped:
             online.warn(
                 f"{capture.dropped} of {capture.dropped + len(indices)} frames were "
-                "dropped: newer ones came before they were used"
+                "dropped, as newer ones came before they were used, and are "
+                "interpolated in the result"
             )
         if capture.path is not None:
             online.video, online.picks = capture.path, indices
@@ -286,7 +287,8 @@ def _follow(
         late = sorted(latencies)[int(0.95 * (len(latencies) - 1))]
         here = len(indices) - capture.skipped
         rate = here / max(now - begun, 1e-9)
-        figures = _figures(estimate, rate, late, capture.dropped)
+        looks = online.counts.looks / max(online.counts.frames, 1) * rate
+        figures = _figures(estimate, rate, looks, late, capture.dropped)
         done = {}
         if capture.every and capture.length is not None:
             total = max(capture.length - capture.skipped, here)
@@ -311,13 +313,15 @@ def _follow(
     return indices
 
 
-def _figures(estimate: Any, rate: float, late: float, dropped: int) -> dict[str, str]:
+def _figures(
+    estimate: Any, rate: float, looks: float, late: float, dropped: int
+) -> dict[str, str]:
     relative = estimate.scale_sigma / estimate.scale
     known = relative == relative
     return {
         "status": estimate.status,
         "time": f"{estimate.timestamp:.1f} s",
-        "frames a second": f"{rate:.1f}",
+        "frames a second": f"{rate:.1f} ({looks:.1f} of them searched for people)",
         "latency (95 %)": f"{1000 * late:.0f} ms",
         "dropped": str(dropped),
         "people": str(len(estimate.people)),

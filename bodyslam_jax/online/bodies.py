@@ -26,9 +26,12 @@ _MEAN_BETAS = np.zeros(10)
 class LiveBodies:
     """People by their numbers, with their filters and the contacts of their feet."""
 
-    def __init__(self, config: Config, body: BodyModel, fps: float) -> None:
+    def __init__(
+        self, config: Config, body: BodyModel, fps: float, spared_cores: int
+    ) -> None:
         self.config, self.body, self.fps = config, body, fps
-        self.found = LivePeople(fps, config.detection, config.association)
+        given = config.detection, config.association, spared_cores
+        self.found = LivePeople(fps, *given)
         self.filters: dict[int, PersonFilter] = {}
         self.last_seen: dict[int, float] = {}
         self.contacts: dict[int, Float[np.ndarray, " 4"]] = {}

@@ -104,7 +104,7 @@ class Maps:
         self.now = self.submitted = self.rested = -np.inf
         """Times of the frame that is processed, of that with which the window began,
         and from which it may begin again, s."""
-        self.bodies = LiveBodies(config, body, fps)
+        self.bodies = LiveBodies(config, body, fps, spared_cores=int(threads))
         self.counts, self.record = Counts(), Record()
         self.warnings: dict[str, None] = {}
         self.seconds: dict[str, float] = {}

@@ -34,8 +34,6 @@ SCALE_WALK = 0.015
 """Relative standard deviation by which the unit of the map changes in a second: the
 drift that is measured in a minute of a rendered room, 12 %, over the root of its
 seconds (`benchmarks/online.md`)."""
-_MAX_SCALE_SIGMA = 0.5
-"""Relative standard deviation of s from which it is unknown: two of them reach 0."""
 _MIN_OBSERVATIONS = 100
 """Least number of observations from which the noise of the tracks is estimated."""
 
@@ -181,9 +179,10 @@ class Window(Content):
             variance, shapes = inflate_fitted_shapes(*given)
         self.shape_covariance[seen] = np.asarray(shapes)[seen]
         if not self.fixed:
-            sigma, most = float(variance) ** 0.5, _MAX_SCALE_SIGMA * float(state.scale)
+            sigma = float(variance) ** 0.5
             # The next solve looks for a first scale again.
-            self.scale_sigma = sigma if sigma < most else float("nan")
+            known = sigma < window_problem.MAX_SCALE_SIGMA * float(state.scale)
+            self.scale_sigma = sigma if known else float("nan")
             return
         betas = np.asarray(state.shapes, float)
         relative = []

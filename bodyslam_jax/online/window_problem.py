@@ -36,12 +36,14 @@ log = logging.getLogger(__name__)
 
 _MIN_PARALLAX_RAD = np.radians(0.5)
 """Least parallax of a landmark in the graph, rad: ten times the noise of a ray."""
+MAX_SCALE_SIGMA = 0.5
+"""Relative standard deviation of s from which it is unknown: two of them reach 0."""
 _MIN_OBSERVATIONS = 3
 """Least number of observations of a landmark in the graph."""
 _MAX_MEDIAN_ERROR = 6.0
 """Largest median reprojection error of a landmark in the graph, in its standard
 deviation."""
-_MIN_STEPS = 15
+_MIN_STEPS = 8
 """Least number of predicted steps from which s is estimated: about a second."""
 _GROUND_HALF_INFORMATION_FRAMES = 10.0
 """Number of frames with ground whose information is half that of infinitely many."""
@@ -318,7 +320,8 @@ def _ground(
             start = initialisation.scale_start(
                 state, steps, contact, shared_error=weights.fitted_step_error
             )
-        if np.isfinite(start.standard_error) and start.value > 0:
+        # An unknown error is infinite or NaN.
+        if start.standard_error < MAX_SCALE_SIGMA * start.value:
             scale = jnp.asarray(start.value, state.scale.dtype)
             state, begun = eqx.tree_at(lambda s: s.scale, state, scale), True
     if contact is None:

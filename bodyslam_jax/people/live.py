@@ -23,7 +23,6 @@ from bodyslam_jax.people.find import (
     MIN_START_SCORE,
     MIN_TRACK_S,
     SEARCH_INTERVAL_S,
-    SQUARE_INPUT_PX,
     confirmed,
     merged,
 )
@@ -39,6 +38,9 @@ from bodyslam_jax.people.regions import behind, regions
 from bodyslam_jax.tracking.appearance import DESCRIPTOR_SIZE, describe, difference
 from bodyslam_jax.tracking.tracker import MAX_COLOUR_DIFFERENCE, Tracker
 
+_SQUARE_INPUT_PX = 224
+"""Side of the square around a person in MoveNet's input: keypoints are as exact as with
+256, in three quarters of the time (`benchmarks/online.md`)."""
 _SEARCH_INTERVAL_TRACKED_S = 1.0
 """Time between two searches of the whole image while somebody is tracked, s."""
 _MAX_PEOPLE = 4
@@ -70,8 +72,15 @@ class LivePeople:
         fps: float,
         settings: Detect = Detect(),
         association: Association = Association(),
+        spared_cores: int = 0,
     ) -> None:
-        self.fps, self.settings = fps, settings
+        """
+        **Arguments:**
+
+        - `fps`: rate by which frames are numbered, 1/s.
+        - `spared_cores`: cores of the processor that the networks leave to others.
+        """
+        self.fps, self.settings, self.spared_cores = fps, settings, spared_cores
         self.tracker = Tracker(fps, association.max_gap, MOVENET_POINTS)
         self.persons: dict[int, _Person] = {}
         self.start: float | None = None
@@ -86,7 +95,10 @@ class LivePeople:
         **Raises:** as `open_network`.
         """
         if self.networks is None:
-            self.networks = open_network(MOVENET), open_network(BLAZEPOSE)
+            self.networks = tuple(
+                open_network(network, spared_cores=self.spared_cores)
+                for network in (MOVENET, BLAZEPOSE)
+            )
 
     def find(
         self, image: UInt8[np.ndarray, "y x 3"], time: float
@@ -99,7 +111,7 @@ class LivePeople:
         alive = self.tracker.alive(self.frame)
         expected = [t.expected(self.frame) for t in alive]
         squares = regions(expected, self.settings.min_height, _MAX_PEOPLE)
-        found = [self._look(image, r, SQUARE_INPUT_PX) for r in squares]
+        found = [self._look(image, r, _SQUARE_INPUT_PX) for r in squares]
         if self.frame >= self.next_search:
             whole = 0, 0, image.shape[1], image.shape[0]
             found.append(self._look(image, whole, COARSE_INPUT_PX))

@@ -49,18 +49,18 @@ BLAZEPOSE_HEAVY = Network(
 NETWORKS = (MOVENET, BLAZEPOSE, BLAZEPOSE_HEAVY)
 
 
-def open_network(network: Network) -> Any:
+def open_network(network: Network, *, spared_cores: int = 0) -> Any:
     """Opens a session of one of the package's networks, after comparing its checksum.
 
-    It uses the processor cores that this process may use, four at most, and none while
-    it waits.
+    It uses the processor cores that this process may use, except `spared_cores`, at
+    least one and at most four, and none while it waits.
 
     **Raises:** `InputError` if the file is missing or is not the one that was shipped,
     or onnxruntime is not installed.
     """
     check_onnxruntime()
     check_network(network)
-    return make_session(network.path)
+    return make_session(network.path, spared_cores=spared_cores)
 
 
 def check_network(network: Network) -> None:
@@ -95,14 +95,16 @@ def network_status() -> list[tuple[str, str]]:
     return rows
 
 
-def make_session(path: Path) -> Any:
-    """Opens an onnxruntime session of an ONNX file on the CPU.
+def make_session(path: Path, *, spared_cores: int = 0) -> Any:
+    """Opens an onnxruntime session of an ONNX file on the CPU; for `spared_cores` see
+    `open_network`.
 
     **Raises:** `InputError` if onnxruntime is missing or does not read the file.
     """
     onnxruntime = check_onnxruntime()
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = min(_available_cores(), _MAX_THREADS)
+    cores = max(1, _available_cores() - spared_cores)
+    options.intra_op_num_threads = min(cores, _MAX_THREADS)
     options.inter_op_num_threads = 1
     # Threads that wait in a busy loop would occupy the cores.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
