@@ -757,7 +757,7 @@ def test_covariances_are_as_large_as_errors_on_simulated_noise(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
     bench = importlib.import_module("solver_calibration")
     # A tenth of the noise that videos have: covariances are those of the linear part.
-    found = bench.calibration(20, draws=60, noise=0.1)["squared"]
+    found = bench.calibration(20, draws=100, noise=0.1)["squared"]
     for name in ("cameras, m", "people, m", "landmarks, m"):
         square, inside = found[name]
         assert abs(square - 1) < 0.15, name
