@@ -282,7 +282,7 @@ def _run(monkeypatch, argv):
 
 def test_command_takes_finished_rows(tmp_path, monkeypatch, capsys, caplog):
     on = Experiment(sequences=("E1", "M2"), family="room", frames=300)
-    plan = PLANS["table1"](on, Config(), tmp_path / "stages")
+    plan = PLANS["table1"](on, Config().for_simulated_people(), tmp_path / "stages")
     journal = Journal(tmp_path / "rows")
     for job in plan.jobs:
         journal.row("table1", job.label, job.key, lambda j=job: _made_up(j.label))
@@ -516,7 +516,9 @@ def test_every_plan_on_forty_frames(tmp_path, few, caplog):
     rows = {}
     for name in ("scale", "landmarks", "motion", "ablation"):
         experiments.run_experiment(name, tmp_path, settings)
-        jobs = PLANS[name](settings, Config(), tmp_path / "stages").jobs
+        jobs = PLANS[name](
+            settings, Config().for_simulated_people(), tmp_path / "stages"
+        ).jobs
         journal = Journal(tmp_path / "rows")
         paths = [journal.path(name, job.label, *job.key) for job in jobs]
         rows[name] = [json.loads(path.read_text()) for path in paths]
