@@ -107,6 +107,20 @@ def test_a_frame_rate_does_not_change_who_sits():
     assert np.ptp(coarse) > 0.05
 
 
+def test_noise_of_depth_does_not_make_a_person_stand():
+    """The pelvis moves by 4 cm along the view or across it, or by 40 cm along."""
+    t = np.arange(120) / 30
+    eyes = np.tile([0.0, 1.5, -4.0], (120, 1))
+    to_and_fro = 0.04 * np.sqrt(2) * np.sin(2 * np.pi * t)
+    path = lambda axis, size: np.eye(3)[axis] * (size * to_and_fro)[:, None]
+    sits = lambda pelvis: seated.sitting_probability(
+        pelvis, np.ones(120, bool), 30.0, eyes
+    )[20:-20]
+    assert sits(path(2, 1.0)).min() > 0.8
+    assert sits(path(0, 1.0)).max() < 0.6
+    assert sits(path(2, 10.0)).max() < 0.2
+
+
 def test_recorded_people_are_told_apart():
     """Subject 14 is among those from whom the constants come, those of `walking.npz`
     count with all other walkers."""
