@@ -1,4 +1,4 @@
-"""Learns the probability that somebody sits from how far the pelvis moves.
+"""Learns the probability that somebody sits from how far the pelvis moves, and how.
 
     python tools/sitting_probability.py CMU.npz ...
 
@@ -8,7 +8,9 @@ on people who sit, a quarter on walkers and runners, a quarter on all others who
 in each group people count alike. Prints the constants of
 `bodyslam_jax.diagnostics.seated`, and how people fare who were left out: mean log
 likelihood (chance is -0.69), mean probability by group, and the share of those who sit
-by the probability that is said. The table stands in `benchmarks/plausibility.md`.
+by the probability that is said. Then the mean posture of the left leg of people who sit
+(right legs are mirrored), for `bodyslam_jax.pipeline.seated_legs`, and the errors of
+legs of people who were left out. The tables stand in `benchmarks/plausibility.md`.
 """
 
 import argparse
@@ -18,12 +20,14 @@ import numpy as np
 from plausibility_thresholds import place
 
 from bodyslam_jax import motion
+from bodyslam_jax.body.skeleton import ANKLES, HIPS, KNEES
 from bodyslam_jax.diagnostics.seated import (
     SEATED_THIGH_DEGREES,
     log_movement,
     pelvis_movement,
     thigh_angle,
 )
+from bodyslam_jax.geometry import so3_numpy as so3
 
 SITTING = ("01_08", "13_01", "14_27", "14_28", "14_29", "14_31", "14_32")
 STANDING_THIGH_DEGREES = 40.0
@@ -73,10 +77,70 @@ def learn(x: np.ndarray, sits: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return b
 
 
+Legs = tuple[str, np.ndarray, np.ndarray]
+
+
+def legs(path: Path) -> list[Legs]:
+    """Subject, rotations (thigh, knee, ankle) of the left leg and of the mirrored right
+    one, and positions of their knees and ankles about the hips in units of thigh and
+    shin, of all frames of an archive in which somebody sits."""
+    found = []
+    for clip in motion.read_motion(path):
+        if clip.phase or clip.name not in SITTING:
+            continue
+        joints = place(clip)
+        here = thigh_angle(joints) > SEATED_THIGH_DEGREES
+        turn = so3.exp(clip.poses.reshape(-1, 24, 3)[here].astype(float))
+        joints = joints[here]
+        left = turn[:, 0, :, 0] * [1.0, 0.0, 1.0]
+        left = left / np.linalg.norm(left, axis=1, keepdims=True)
+        up = np.broadcast_to([0.0, 1.0, 0.0], left.shape)
+        level = np.swapaxes(np.stack([left, up, np.cross(left, up)], axis=-1), 1, 2)
+        for side, sign in enumerate(([1.0, 1.0, 1.0], [1.0, -1.0, -1.0])):
+            hip, knee, ankle = (pair[side] for pair in (HIPS, KNEES, ANKLES))
+            thigh = level @ turn[:, 0] @ turn[:, hip]
+            rotations = np.stack([thigh, turn[:, knee], turn[:, ankle]], axis=1)
+            bones = np.stack(
+                [joints[:, knee] - joints[:, hip], joints[:, ankle] - joints[:, knee]],
+                1,
+            )
+            bones = np.einsum("tij,tkj->tki", level, bones) * [sign[1], 1.0, 1.0]
+            found.append((clip.name.split("_")[0], so3.log(rotations) * sign, bones))
+    return found
+
+
+def mean_posture(found: list[Legs]) -> np.ndarray:
+    """Mean rotations, in which people count alike, by steps on the manifold."""
+    people = sorted({subject for subject, *_ in found})
+    each = [np.concatenate([r for s, r, _ in found if s == one]) for one in people]
+    mean = so3.exp(each[0][0])
+    for _ in range(20):
+        away = [
+            so3.log(np.swapaxes(mean, 1, 2) @ so3.exp(r)).mean(axis=0) for r in each
+        ]
+        mean = mean @ so3.exp(np.mean(away, axis=0))
+    return so3.log(mean)
+
+
+def tell_posture(found: list[Legs]) -> None:
+    print("thigh, knee, ankle, rad:", mean_posture(found).round(2).tolist())
+    for one in sorted({subject for subject, *_ in found}):
+        thigh, knee, _ = so3.exp(mean_posture([leg for leg in found if leg[0] != one]))
+        bones = np.concatenate([b for s, _, b in found if s == one])
+        length = np.linalg.norm(bones, axis=2, keepdims=True)
+        # A bone of the body at rest hangs.
+        guess = -np.stack([thigh[:, 1], (thigh @ knee)[:, 1]]) * length
+        error = np.cumsum(guess - bones, axis=1)
+        rms = np.sqrt((error**2).sum(axis=2).mean(axis=0))
+        print(f"  {one} left out: knee {rms[0]:.2f} m, ankle {rms[1]:.2f} m")
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Learns who sits.")
+    parser = argparse.ArgumentParser(description="Learns who sits, and how.")
     parser.add_argument("archives", type=Path, nargs="+")
-    rows = [row for path in parser.parse_args().archives for row in frames(path)]
+    archives = parser.parse_args().archives
+    tell_posture([leg for path in archives for leg in legs(path)])
+    rows = [row for path in archives for row in frames(path)]
     subject, group, x = (np.array(column) for column in zip(*rows))
     sits, weight = group == "sits", weights(subject, group)
     print(

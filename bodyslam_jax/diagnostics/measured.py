@@ -110,7 +110,7 @@ def measured(
         pixels = pixels_per_metre(joint, k)
         unseen[k] = seated.legs_unseen(keypoint[k], joint.present[k], sequence.fps)
         other = seated.other_posture_probability(
-            result.joints[k], unseen[k], sequence.fps
+            result.joints[k], unseen[k], sequence.fps, result.T_WC[:, :3, 3]
         )
         sigma[k] = joint_sigma(keypoint[k], given[k], pixels, sequence.fps, other)
     sigma = np.where(joint.present[..., None], sigma, 0.0)

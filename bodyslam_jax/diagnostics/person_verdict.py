@@ -102,7 +102,10 @@ def assess_person(
         not_measured=found.shares(person, present),
         inferred_frames=tuple((int(run.start), int(run.stop - 1)) for run in inferred),
         seated=stretches(
-            result.joints[person], present & found.legs_unseen[person], sequence.fps
+            result.joints[person],
+            present & found.legs_unseen[person],
+            sequence.fps,
+            result.T_WC[:, :3, 3],
         ),
         leg_px=leg_px,
         speed_noise=speed_noise,

@@ -31,10 +31,18 @@ the frames of CMU recordings have it between 40 degrees and this, and 4 % of tho
 people who sit down and stand up."""
 _MIN_MOVEMENT_M = 0.01
 """Movement that counts as none: what estimates of people who keep still show."""
+_DEPTH_NOISE_M = 0.05
+"""Movement along the view that estimates show of people who keep still and of whom no
+leg is in view: 0.05 m of a real man who sits and moves by 0.01 m, across the view 0.02.
+"""
 _LOGIT_AT_1_M, _LOGIT_PER_LOG = -4.03, -1.29
 """Log odds of sitting at a movement of 1 m, and their change with its logarithm:
 logistic regression on recordings (`tools/sitting_probability.py`), half of whose weight
 is on people who sit, a quarter on walkers and a quarter on others who stand."""
+
+_POSTURE_WINDOW_S = 2.0
+"""Time over which log odds are averaged for the posture that a body is given: it is to
+last for as long as people sit. Over 1 to 3 s that errs as often, within 1 %."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,36 +61,51 @@ def legs_unseen(
     """Returns the frames of a person about which no knee and no ankle is shown, within
     half of `WINDOW_S` before and after and but for mistakes."""
     shown = (keypoint[:, KNEES_AND_ANKLES] & present[:, None]).mean(axis=1)
-    mean = lambda x: uniform_filter1d(x, _window(fps), mode="constant")
+    mean = lambda x: uniform_filter1d(x, _odd(WINDOW_S, fps), mode="constant")
     return present & (mean(shown) < _MAX_SHOWN_SHARE * mean(present.astype(float)))
 
 
 def sitting_probability(
-    pelvis: Float[np.ndarray, "t 3"], present: Bool[np.ndarray, " t"], fps: float
+    pelvis: Float[np.ndarray, "t 3"],
+    present: Bool[np.ndarray, " t"],
+    fps: float,
+    eyes: Float[np.ndarray, "t 3"] | None = None,
 ) -> Float[np.ndarray, " t"]:
     """Returns the probability that a person sits, frame by frame, from the movement of
     the pelvis alone; NaN where the person is absent.
 
-    `pelvis` is in a world whose y axis is up, m.
+    `pelvis` and the camera's positions `eyes` are in a world whose y axis is up, m.
+    With these, movement along the view counts only beyond the noise of depth.
     """
     found = np.full(len(pelvis), np.nan)
     for run in runs(present):
-        movement = pelvis_movement(pelvis[run], fps)
+        movement = pelvis_movement(
+            pelvis[run], fps, None if eyes is None else eyes[run]
+        )
         logit = _LOGIT_AT_1_M + _LOGIT_PER_LOG * log_movement(movement)
         found[run] = 1 / (1 + np.exp(-logit))
     return found
 
 
 def pelvis_movement(
-    pelvis: Float[np.ndarray, "t 3"], fps: float
+    pelvis: Float[np.ndarray, "t 3"],
+    fps: float,
+    eyes: Float[np.ndarray, "t 3"] | None = None,
 ) -> Float[np.ndarray, " t"]:
     """Returns the standard deviation of the pelvis' horizontal position within the
-    `WINDOW_S` about each frame, m."""
+    `WINDOW_S` about each frame, m; given the camera's positions `eyes`, less the noise
+    along the view."""
     place = pelvis[:, _HORIZONTAL_AXES] - pelvis[:1, _HORIZONTAL_AXES]
-    mean = lambda x: uniform_filter1d(x, _window(fps), axis=0, mode="constant")
-    share = mean(np.ones((len(place), 1)))
-    variance = mean(place**2) / share - (mean(place) / share) ** 2
-    return np.sqrt(np.maximum(variance, 0.0).sum(axis=1))
+    mean = lambda x: _mean_over(WINDOW_S, x, fps)
+    product = lambda x: x[:, :, None] * x[:, None]
+    covariance = mean(product(place)) - product(mean(place))
+    variance = np.trace(covariance, axis1=1, axis2=2)
+    if eyes is not None:
+        view = (pelvis - eyes)[:, _HORIZONTAL_AXES]
+        view = view / np.maximum(np.linalg.norm(view, axis=1, keepdims=True), 1e-9)
+        along = np.einsum("ti,tij,tj->t", view, covariance, view)
+        variance = variance - np.minimum(along, _DEPTH_NOISE_M**2)
+    return np.sqrt(np.maximum(variance, 0.0))
 
 
 def log_movement(movement: Float[np.ndarray, "*t"]) -> Float[np.ndarray, "*t"]:
@@ -100,12 +123,31 @@ def thigh_angle(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, " t"]:
     return np.degrees(np.arccos(down)).mean(axis=1)
 
 
+def sits(
+    joints: Float[np.ndarray, "t 24 3"],
+    unseen: Bool[np.ndarray, " t"],
+    fps: float,
+    eyes: Float[np.ndarray, "t 3"] | None = None,
+) -> Bool[np.ndarray, " t"]:
+    """Returns the frames `unseen` (`legs_unseen`) in which a person more probably sits
+    than stands, by the mean of the log odds over `_POSTURE_WINDOW_S`."""
+    chance = sitting_probability(joints[:, PELVIS], unseen, fps, eyes)
+    found = np.zeros(len(joints), bool)
+    for run in runs(unseen):
+        odds = np.log(chance[run] / (1 - chance[run]))
+        found[run] = _mean_over(_POSTURE_WINDOW_S, odds, fps) > 0
+    return found
+
+
 def stretches(
-    joints: Float[np.ndarray, "t 24 3"], unseen: Bool[np.ndarray, " t"], fps: float
+    joints: Float[np.ndarray, "t 24 3"],
+    unseen: Bool[np.ndarray, " t"],
+    fps: float,
+    eyes: Float[np.ndarray, "t 3"] | None = None,
 ) -> tuple[Seated, ...]:
     """Returns the stretches of frames `unseen` (`legs_unseen`), each with its
     probability that the person sits."""
-    probability = sitting_probability(joints[:, PELVIS], unseen, fps)
+    probability = sitting_probability(joints[:, PELVIS], unseen, fps, eyes)
     return tuple(
         Seated((int(run.start), int(run.stop - 1)), float(probability[run].mean()))
         for run in runs(unseen)
@@ -113,15 +155,27 @@ def stretches(
 
 
 def other_posture_probability(
-    joints: Float[np.ndarray, "t 24 3"], unseen: Bool[np.ndarray, " t"], fps: float
+    joints: Float[np.ndarray, "t 24 3"],
+    unseen: Bool[np.ndarray, " t"],
+    fps: float,
+    eyes: Float[np.ndarray, "t 3"] | None = None,
 ) -> Float[np.ndarray, " t"]:
     """Returns the probability that a person stands whose body sits, or the reverse; 0
     where legs are seen."""
-    probability = sitting_probability(joints[:, PELVIS], unseen, fps)
+    probability = sitting_probability(joints[:, PELVIS], unseen, fps, eyes)
     sits = thigh_angle(joints) > SEATED_THIGH_DEGREES
     return np.where(unseen, np.where(sits, 1 - probability, probability), 0.0)
 
 
-def _window(fps: float) -> int:
-    """Returns `WINDOW_S` in frames, an odd number."""
-    return 2 * round(WINDOW_S * fps / 2) + 1
+def _mean_over(
+    time: float, values: Float[np.ndarray, "*tc"], fps: float
+) -> Float[np.ndarray, "*tc"]:
+    """Returns the mean over `time` about each frame, at the ends over what there is."""
+    mean = lambda x: uniform_filter1d(x, _odd(time, fps), axis=0, mode="constant")
+    share = mean(np.ones(len(values))).reshape(-1, *[1] * (values.ndim - 1))
+    return mean(values) / share
+
+
+def _odd(time: float, fps: float) -> int:
+    """Returns a time in frames, an odd number."""
+    return 2 * round(time * fps / 2) + 1

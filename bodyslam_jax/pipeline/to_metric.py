@@ -15,6 +15,7 @@ from bodyslam_jax.geometry.whittaker import low_pass, low_pass_rotations
 from bodyslam_jax.ground.gravity import GravityCues, Upright, level, measured_up
 from bodyslam_jax.ground.stances import find_stances, toes_standing
 from bodyslam_jax.ground.vertical_edges import Edges
+from bodyslam_jax.pipeline.seated_legs import nearer_floor, with_seated_legs
 from bodyslam_jax.types import JointEstimate, Result, Sequence, SfmResult
 
 
@@ -28,19 +29,24 @@ def to_metric(
 ) -> tuple[Result, Upright]:
     """Returns the result in a metric world whose y axis is up, and the estimate of up.
 
-    Feet that stand on the ground are at y = 0. `edges` are straight edges in the world
-    of `joint`.
+    Feet that stand on the ground are at y = 0. Legs that are not in view sit where that
+    is more probable (`seated_legs`), unless a regressor gave them. `edges` are straight
+    edges in the world of `joint`.
     """
     T_WC = joint.cameras.copy()
     T_WC[:, :3, 3] *= joint.scale
     joints = _placed(sequence, config, body, joint, T_WC)[2]
+    shown = np.zeros((*joint.present.shape, 25), bool)
+    if joint.present.any():
+        shown = people.shown_keypoints(sequence, body)
+    legs = people.legs_shown(shown, joint.present, sequence.fps)
     above = joint.above_ground
     # Rungs and steps under feet are no plane: feet are where the ground is below them.
     above = np.zeros((*joint.present.shape, 3)) if above is None else above
     landmarks = joint.scale * joint.landmarks
     standing = toes_standing(joint.contacts)
     cues = GravityCues(
-        trunks=_trunks(sequence, body, joint, T_WC, joints),
+        trunks=_trunks(joint, legs, T_WC, joints),
         feet=joints[:, :, list(FEET)] - above[:, :, None],
         present=joint.present,
         eyes=T_WC[:, :3, 3],
@@ -56,12 +62,24 @@ def to_metric(
     landmarks = landmarks @ turn[:3, :3].T + turn[:3, 3]
     poses, trans, joints = _placed(sequence, config, body, joint, T_WC)
     if joint.present.any():
-        lowered = joints - (above @ turn[:3, :3].T)[:, :, None]
         # By climbers only if nobody stands on the ground.
         climbs = np.any(above != 0, axis=(1, 2))
         on_ground = joint.present & ~climbs[:, None]
         told = on_ground if on_ground.any() else joint.present
-        floor = floor_height(body, joint.shapes, lowered, told, sequence.fps, standing)
+        of, rest = (body, joint.shapes), (sequence.fps, standing)
+        lower = (above @ turn[:3, :3].T)[:, :, None]
+        floor = standing_height(*of, joints - lower, told & legs, *rest)
+        fitted = joint.present & people.without_bodies(sequence)[:, None]
+        seats = with_seated_legs(
+            poses, joints, shown, fitted, sequence.fps, T_WC[:, :3, 3]
+        )
+        if not np.array_equal(seats, poses):
+            changed = (seats != poses).any(axis=2)
+            sits = _posed(body, seats, joint.shapes, trans)
+            nearer = nearer_floor(joints, sits, changed, floor)
+            poses = np.where(nearer[..., None], seats, poses)
+            joints = np.where(nearer[..., None, None], sits, joints)
+        floor = floor_height(*of, joints - lower, told, *rest)
         for points in (T_WC[:, :3, 3], trans, joints, landmarks):
             points[..., 1] -= floor
     result = Result(
@@ -80,9 +98,8 @@ def to_metric(
 
 
 def _trunks(
-    sequence: Sequence,
-    body: body_.BodyModel,
     joint: JointEstimate,
+    legs: Bool[np.ndarray, "h t"],
     T_WC: Float[np.ndarray, "t 4 4"],
     joints: Float[np.ndarray, "h t 24 3"],
 ) -> Float[np.ndarray, "h t 3"]:
@@ -90,10 +107,6 @@ def _trunks(
     pelvis to neck of people whose legs are not shown in most of their frames, as
     nothing else holds the pelvis' pitch then."""
     trunks = (T_WC @ joint.roots)[..., :3, 1]
-    if not joint.present.any():
-        return trunks
-    shown = people.shown_keypoints(sequence, body)
-    legs = people.legs_shown(shown, joint.present, sequence.fps)
     mostly = 2 * (legs & joint.present).sum(axis=1) >= joint.present.sum(axis=1)
     line = joints[:, :, NECK] - joints[:, :, PELVIS]
     line = line / np.maximum(np.linalg.norm(line, axis=-1, keepdims=True), 1e-9)
@@ -120,12 +133,22 @@ def _placed(
     root = so3.log(np.asarray(T_WH[..., :3, :3]))
     poses = np.concatenate([root, joint.poses.reshape(*root.shape[:2], 69)], axis=-1)
     poses, pelvis = _smoothed(sequence, config, joint.present, poses, T_WH[..., :3, 3])
-    shapes = jnp.asarray(joint.shapes)
-    trans = pelvis - np.asarray(body_.rest_joints(body, shapes))[:, None, 0]
-    frames = len(T_WC)
+    rest = np.asarray(body_.rest_joints(body, jnp.asarray(joint.shapes)))
+    trans = pelvis - rest[:, None, 0]
+    return poses, trans, _posed(body, poses, joint.shapes, trans)
+
+
+def _posed(
+    body: body_.BodyModel,
+    poses: Float[np.ndarray, "h t 72"],
+    shapes: Float[np.ndarray, "h 10"],
+    trans: Float[np.ndarray, "h t 3"],
+) -> Float[np.ndarray, "h t 24 3"]:
+    """Returns the joints of posed bodies, m, by a program compiled for few lengths."""
+    frames = poses.shape[1]
     longer = lengthened((poses, trans), padded_length(frames), axis=1)
-    joints = _joints(body, longer[0], shapes[:, None], longer[1])
-    return poses, trans, np.array(joints)[:, :frames]
+    joints = _joints(body, longer[0], jnp.asarray(shapes)[:, None], longer[1])
+    return np.array(joints)[:, :frames]
 
 
 def floor_height(
@@ -141,13 +164,29 @@ def floor_height(
 
     `joints` are in a world whose y axis is up, m.
     """
-    sole = np.median([sole_height(body, shape) for shape in shapes])
+    found = standing_height(body, shapes, joints, present, fps, standing)
+    if found is not None:
+        return found
+    lowest = joints[present][:, list(FEET), 1].min(axis=1)
+    return float(np.quantile(lowest, 0.05)) - _sole(body, shapes)
+
+
+def standing_height(
+    body: body_.BodyModel,
+    shapes: Float[np.ndarray, "h 10"],
+    joints: Float[np.ndarray, "h t 24 3"],
+    present: Bool[np.ndarray, "h t"],
+    fps: float,
+    standing: Bool[np.ndarray, "h t 2"] | None = None,
+) -> float | None:
+    """Returns the height of the floor under standing feet, m; `None` if none stand."""
     stances = find_stances(joints[:, :, list(FEET)], present, fps, standing)
     heights = np.concatenate([places[:, 1] for places in stances])
-    if len(heights):
-        return float(np.median(heights) - sole)
-    lowest = joints[present][:, list(FEET), 1].min(axis=1)
-    return float(np.quantile(lowest, 0.05) - sole)
+    return float(np.median(heights)) - _sole(body, shapes) if len(heights) else None
+
+
+def _sole(body: body_.BodyModel, shapes: Float[np.ndarray, "h 10"]) -> float:
+    return float(np.median([sole_height(body, shape) for shape in shapes]))
 
 
 def sole_height(body: body_.BodyModel, shape: Float[np.ndarray, " 10"]) -> float:
