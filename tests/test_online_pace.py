@@ -2,18 +2,20 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from passing_camera import CAMERA, passing
 
 import bodyslam_jax as bs
-from bodyslam_jax import simulation
+from bodyslam_jax import graph, motion, simulation
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.online import maps, online
 from bodyslam_jax.online.record import Record, Seen, Slot, evenly, parts_of
 from bodyslam_jax.online.slots import Slots
 from bodyslam_jax.online.window import Solved, Window
-from bodyslam_jax.online.window_content import Measured
+from bodyslam_jax.online.window_content import FRAMES, Measured
+from bodyslam_jax.online.window_problem import at_times
 from bodyslam_jax.people.live import LivePeople
 
 PIXELS = np.random.default_rng(5).uniform([-40, 150], [40, 350], (25, 2))
@@ -119,6 +121,29 @@ def test_a_gap_of_the_source_is_not_filled():
     frames, kept = evenly(recorded(times), 30.0)
     inside = [f for f in frames if 10 / 30 < f.time < 44 / 30]
     assert not inside and kept.sum() == 20
+
+
+def test_steps_have_the_times_of_their_frames_by_programs_of_one_size():
+    window = Window(CAMERA, bs.load_body_model(), Config(), 10.0, 1)
+    network = motion.load_motion_model()
+    even = motion.make_clock(window.times, network.fps)
+    present = jnp.ones((1, FRAMES), bool)
+    given = motion.predict_between, (network, even), window.body, present
+    predictor = graph.MotionPredictor(*given)
+    sizes = set()
+    for n, away in enumerate((0.0, 0.03, 0.045)):
+        uneven = np.arange(FRAMES) / 10 + away * np.cos(np.pi * np.arange(FRAMES))
+        window.times = uneven + 7.0
+        _, clock = at_times(window, predictor, present).model
+        sizes.add((len(clock.frame), clock.same))
+        steps = np.asarray(clock.steps)[1:-1] / network.fps
+        assert np.abs(steps - np.diff(uneven)[:-1]).max() < 1e-9, n
+    # The source stood still for 20 s.
+    window.times = np.arange(FRAMES) / 10 + np.where(np.arange(FRAMES) < 40, 0.0, 20.0)
+    _, clock = at_times(window, predictor, present).model
+    sizes.add((len(clock.frame), clock.same))
+    assert np.asarray(clock.steps).max() < 0.16 * network.fps
+    assert len(sizes) == 1
 
 
 # What runs when.

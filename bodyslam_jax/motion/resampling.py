@@ -82,15 +82,26 @@ class Clock(eqx.Module):
         )
 
 
-def make_clock(timestamps: Float[np.ndarray, " t"], fps: float = FPS) -> Clock:
+def make_clock(
+    timestamps: Float[np.ndarray, " t"], fps: float = FPS, num_ticks: int | None = None
+) -> Clock:
     """Aligns the ticks of a model, `fps` per second, with the timestamps (s) of a
-    video."""
+    video.
+
+    Args:
+        num_ticks: number of ticks, so that programs do not depend on the timestamps;
+            without it, as many as there are until the last one. Frames after the last
+            tick lie at it.
+    """
     position = (timestamps - timestamps[0]) * fps
     t = len(position)
     same = bool(np.abs(np.diff(position) - 1).max(initial=0) < 0.02)
     if same:
         position = np.arange(t, dtype=float)
-    ticks = np.arange(int(np.ceil(position[-1] - 1e-6)) + 1)
+    if num_ticks is None:
+        num_ticks = int(np.ceil(position[-1] - 1e-6)) + 1
+    ticks = np.arange(num_ticks)
+    position = np.minimum(position, num_ticks - 1)
     frame = np.clip(
         np.searchsorted(position, ticks, side="right") - 1, 0, max(t - 2, 0)
     )

@@ -199,7 +199,7 @@ class Window(Content):
         if self.stands is None or not roots.present.any():
             return np.zeros((self.places, FRAMES, 4))
         present = jnp.asarray(roots.present)
-        predictor = dataclasses.replace(self.stands, present=present)
+        predictor = window_problem.at_times(self, self.stands, present)
         return contact_probability(predictor, state, self.fps)
 
     def _keep(

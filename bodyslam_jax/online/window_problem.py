@@ -7,13 +7,14 @@ that it adds to that of earlier frames.
 
 import dataclasses
 import logging
+import math
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
-from bodyslam_jax import graph, initialisation, people
+from bodyslam_jax import graph, initialisation, motion, people
 from bodyslam_jax.geometry.lengths import put
 from bodyslam_jax.geometry.triangulation import triangulate, widest_angle
 from bodyslam_jax.graph import CHUNK
@@ -139,9 +140,8 @@ def make(
         window.predictor = motion_predictor(*given)
         window.stands = contact_predictor(*given)
     located = window.located | (np.arange(FRAMES) < CHUNK)
-    predictor = dataclasses.replace(
-        window.predictor, present=jnp.asarray(roots.present & located)
-    )
+    there = jnp.asarray(roots.present & located)
+    predictor = at_times(window, window.predictor, there)
     prediction = predict(predictor, state)
     legs = people.legs_shown(
         people.shown_keypoints(sequence, window.body), roots.present, window.fps
@@ -193,6 +193,21 @@ def make(
     if problem.layout.num_chunks != FRAMES // CHUNK:
         log.warning("a window's landmarks fit in no table of its size")
     return problem, state, told if metric and not window.fixed else told[:0]
+
+
+def at_times(
+    window: Content, predictor: graph.MotionPredictor, present: Bool[Array, "h t"]
+) -> graph.MotionPredictor:
+    """Returns a predictor for the times of the window's frames, which lie up to half a
+    step from even ones: a step that took longer is longer."""
+    network, _ = predictor.model
+    even = np.arange(FRAMES) / window.fps
+    away = window.times - even
+    # After a source stood still, its clock is another one.
+    away = np.clip(away - np.median(away), -0.5 / window.fps, 0.5 / window.fps)
+    ticks = math.ceil(FRAMES / window.fps * network.fps)
+    clock = motion.make_clock(even + away, network.fps, num_ticks=ticks)
+    return dataclasses.replace(predictor, model=(network, clock), present=present)
 
 
 def _tracks(
@@ -357,7 +372,7 @@ def _floor(
         return None
     probability = None
     if window.stands is not None:
-        stands = dataclasses.replace(window.stands, present=jnp.asarray(present))
+        stands = at_times(window, window.stands, jnp.asarray(present))
         probability = contact_probability(stands, state, window.fps)
     fitted = np.ones(window.places, bool)
     seen = present, sequence.keypoints, fitted, window.fps, window.config.gravity
