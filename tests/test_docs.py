@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 import bodyslam_jax
+from bodyslam_jax import simulation
+from bodyslam_jax.config import Simulation
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -68,9 +70,8 @@ def code_of(page: Path) -> str:
 )
 def test_code_in_the_documentation_runs(page, tmp_path):
     if "SEQUENCE_FOLDER" in code_of(page):
-        simulate = ["simulate", "SEQUENCE_FOLDER", "--length", "60"]
-        program = [sys.executable, "-m", "bodyslam_jax", *simulate]
-        subprocess.run(program, check=True, capture_output=True, cwd=tmp_path)
+        simulated = simulation.simulate(Simulation(length=60))
+        simulation.write_sequence(tmp_path / "SEQUENCE_FOLDER", simulated)
     script = tmp_path / f"{page.stem}.py"
     script.write_text(code_of(page))
     done = subprocess.run(
