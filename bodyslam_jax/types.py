@@ -17,6 +17,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+DEFAULT_FPS = 30.0
+"""Frame rate of inputs that do not tell theirs, 1/s: that of most cameras, and of the
+motion model."""
+
+
+def mean_rate(timestamps: Float[np.ndarray, " t"]) -> float:
+    """Returns the mean frame rate, 1/s; `DEFAULT_FPS` for a single frame."""
+    if len(timestamps) < 2:
+        return DEFAULT_FPS
+    return float((len(timestamps) - 1) / (timestamps[-1] - timestamps[0]))
+
 
 @dataclasses.dataclass(frozen=True)
 class Intrinsics:
@@ -188,8 +199,7 @@ class Sequence:
     @property
     def fps(self) -> float:
         """Mean frame rate, 1/s."""
-        t = self.timestamps
-        return float((len(t) - 1) / (t[-1] - t[0])) if len(t) > 1 else 30.0
+        return mean_rate(self.timestamps)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -434,8 +444,7 @@ class Result:
     @property
     def fps(self) -> float:
         """Mean frame rate, 1/s; 30 for a single frame."""
-        t = self.timestamps
-        return float((len(t) - 1) / (t[-1] - t[0])) if len(t) > 1 else 30.0
+        return mean_rate(self.timestamps)
 
     @property
     def located(self) -> Bool[np.ndarray, " t"]:

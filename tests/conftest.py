@@ -33,14 +33,9 @@ a test: two processes stay below 4 GB."""
 
 _LONGEST = (
     *("solver", "docs", "online", "marginalisation", "experiments", "toolkit"),
-    *(
-        "posture_basis",
-        "frontend_lens",
-        "online_fixed",
-        "motion_training",
-        "evaluation",
-    ),
-    *("camera_evidence", "pipeline", "stack_cases", "given_facts", "contact"),
+    *("posture_basis", "frontend_lens", "online_fixed", "motion_training"),
+    *("evaluation", "camera_evidence", "pipeline", "stack_cases", "given_facts"),
+    *("contact",),
     *("compilation", "experiments_video", "mixed_precision", "synthetic_writing"),
     *("batch", "motion_coupling", "frontend_motion", "people_floor", "graph"),
     *("people_noise", "path_clock", "interruption", "fuzz", "globals", "safe_pickle"),

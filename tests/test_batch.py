@@ -555,7 +555,7 @@ def test_rows_of_an_experiment_are_computed_by_an_engine(tmp_path, monkeypatch):
             raise ValueError("no motion.")
 
         compute = {"good": lambda: {"value": 3}, "bad": bad}
-        jobs = [Job(name, (name,), 1.0, one, dict) for name, one in compute.items()]
+        jobs = [Job(name, (name,), 1.0, one) for name, one in compute.items()]
         return Plan(jobs, lambda out, rows: [out / f"{len(rows)} rows"])
 
     class Engine:

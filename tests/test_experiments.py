@@ -28,7 +28,7 @@ from bodyslam_jax.experiments import (
     tables,
 )
 from bodyslam_jax.experiments.ablation import shake
-from bodyslam_jax.experiments.jobs import Journal, fits
+from bodyslam_jax.experiments.jobs import Journal
 from bodyslam_jax.experiments.plans import PLANS
 from bodyslam_jax.experiments.scenario import (
     NAMES,
@@ -145,24 +145,6 @@ def test_rows_are_computed_once(tmp_path):
     journal.path("table1", "M2-room", 1, "x").write_text("{")
     journal.row("table1", "M2-room", (1, "x"), compute)
     assert len(calls) == 4
-
-
-def test_forms_of_rows():
-    form = {"sequence": "E1-room", "status": str, "scale": float, "path": [[float]]}
-    row = {"sequence": "E1-room", "status": "converged", "scale": None, "more": 1}
-    row |= {"path": [[1, 0.5], [None]]}
-    assert fits(row, form)
-    for name, bad in (
-        ("sequence", "E2-room"),
-        ("status", None),
-        ("scale", "1"),
-        ("scale", True),
-        ("path", [1.0]),
-        ("path", {}),
-    ):
-        assert not fits({**row, name: bad}, form), name
-        assert not fits({k: v for k, v in row.items() if k != name}, form)
-    assert not fits(None, form) and not fits([row], form) and not fits(None, dict)
 
 
 def test_tables_as_text():
@@ -364,16 +346,13 @@ def undrawn(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize(
-    "text", ["null", "[]", "{}", '{"sequence": "E1-room"}', '{"a": ', "of M2"]
-)
+@pytest.mark.parametrize("text", ["null", "[]", '{"a": '])
 def test_files_that_are_no_rows_are_computed_again(tmp_path, made_up, caplog, text):
     on, computed = made_up
     experiments.run_experiment("table1", tmp_path, on)
     (file,) = (tmp_path / "rows").glob("table1-E1*")
-    (other,) = (tmp_path / "rows").glob("table1-M2*")
     whole = file.read_text()
-    file.write_text(other.read_text() if text == "of M2" else text)
+    file.write_text(text)
     computed.clear()
     caplog.set_level("INFO")
     experiments.run_experiment("table1", tmp_path, on)

@@ -16,6 +16,9 @@ from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.capture import Capture
 from bodyslam_jax.online import checkpoint, online
+from bodyslam_jax.online.loops import Correction
+from bodyslam_jax.sfm.places import Place
+from bodyslam_jax.sfm.pose_graph import Edge
 from bodyslam_jax.types import Intrinsics, Result, Sequence
 
 NUM, STOP = 24, 10
@@ -76,6 +79,23 @@ def test_a_state_is_written_and_read(begun, tmp_path):
     assert found.body is not begun.body and found.world is not begun.world
     late = found.update(None, 0.1, points=(np.zeros(0, int), np.zeros((0, 2))))
     assert late.status == "late"
+
+
+def test_places_and_loops_are_in_a_state(begun, tmp_path):
+    place = Place(np.full((2, 32), 7, np.uint8), np.ones((2, 3)))
+    loops = begun.loops
+    loops.add(place, 0.1, 3, np.eye(4), np.eye(4))
+    loops.keyframes.append(loops.new[0])
+    loops.edges.append(Edge(0, 1, np.eye(4), 0.1, np.eye(7), loop=True))
+    half = np.array([0.5, 0.25])
+    eye = np.tile(np.eye(3), (2, 1, 1))
+    loops.correction = Correction(np.array([3, 9]), eye, np.zeros((2, 3)), half)
+    checkpoint.save(begun, tmp_path / "a.state")
+    found = another()
+    assert checkpoint.resume(found, tmp_path / "a.state")
+    assert found.loops.correction.unit == 0.25 and found.loops.edges[0].log_ratio == 0.1
+    assert found.loops.keyframes[0] is found.loops.new[0]
+    assert found.loops.places[0].descriptors.tolist() == place.descriptors.tolist()
 
 
 def test_there_is_no_state_of_a_second_thread(tmp_path):

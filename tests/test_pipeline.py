@@ -10,8 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import evaluation, export, pipeline, simulation, view
 from bodyslam_jax.body import DEFAULT, load_body_model, write_npz
+from bodyslam_jax.body.skeleton import PELVIS
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.evaluation import before_after
+from bodyslam_jax.experiments import calibration
 from bodyslam_jax.ground.gravity import upright
 from bodyslam_jax.pipeline.run import with_compatible_body
 
@@ -48,6 +50,13 @@ def test_from_measurements_to_a_run_folder(tmp_path, caplog):
     assert float(found["h_ate_se3"]) < 0.15
     assert result.summary["status"] == "ok"
     assert result.T_WC[0, 0, 0] < -0.95  # x points left of the first camera
+    true, eye = calibration.in_world(simulation.as_truth(simulated), simulated.room)
+    error = result.joints[:, :, PELVIS] - true[:, :, PELVIS]
+    assert result.root_sigma is not None and (result.root_sigma > 0).all()
+    assert (np.abs(error) < 4 * result.root_sigma).all()
+    assert (np.abs(error).max(axis=1) > 0.1 * result.root_sigma.mean(axis=1)).any()
+    height = result.summary["camera_height"]
+    assert height["value_m"] == pytest.approx(eye, abs=4 * height["sigma_m"])
 
     with np.load(out / "result.npz", allow_pickle=False) as archive:
         for name, shape in CONTRACT.items():

@@ -87,7 +87,10 @@ def test_a_place_is_claimed_in_metres_and_zero_where_nobody_is():
     np.testing.assert_allclose(found.root_sigma[0, :UNTIL, [0, 2]].T, [[2, 4]] * UNTIL)
     np.testing.assert_allclose(found.root_sigma[0, :UNTIL, 1], 0.05 * 0.9)
     assert (found.root_sigma[0, UNTIL:] == 0).all()
-    assert found.camera_height == pytest.approx(0.05 * 1.5)
+    assert found.camera_height == pytest.approx(0.1 / 2.0 * 1.5)
+    # A camera that does not move has its metres from the people.
+    still = claimed(joint, result, size=0.08, scale_sigma=0.0)
+    assert still.camera_height == pytest.approx(0.08 * 1.5)
 
 
 def test_the_claim_is_the_same_whatever_world_the_graph_has():
@@ -144,7 +147,7 @@ def test_the_claim_for_up_is_the_scatter_of_worlds_with_other_up():
         pelvis[:, 1] -= floor
         places.append(pelvis)
         eyes.append(EYE[1] - floor)
-    found = claimed(joint, result, up=sigma)
+    found = claimed(joint, result, scale_sigma=0.0, up=sigma)
     expected = np.std(places, axis=0)
     got = found.root_sigma[0, :UNTIL]
     np.testing.assert_allclose(got[:, [0, 2]], expected[:, [0, 2]], rtol=0.05)

@@ -21,7 +21,6 @@ from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.graph import CHUNK
 from bodyslam_jax.solver import (
     Stage,
-    clock,
     marginals,
     restrict,
     solve,
@@ -300,25 +299,6 @@ def test_noise_free_scene_is_recovered_and_history_says_how():
     cost = found.histories[0].cost[: steps + 1]
     assert (jnp.diff(cost) <= 0).all()
     assert jnp.isclose(cost[0], problem.cost(start))
-
-
-@pytest.mark.slow
-def test_a_solve_on_the_clock_is_the_same_solve():
-    problem, _, start = make()
-    first = Stage(("cameras", "landmarks"), max_steps=3)
-    # Far above rounding, which differs: the same steps are enough for both.
-    schedule = (first, Stage(rtol=1e-9, max_steps=60))
-    plain = solve(problem, start, schedule=schedule)
-    found, seconds = clock(problem, start, schedule=schedule)
-    assert found.status == plain.status
-    for taken, count, history, same in zip(
-        seconds, plain.num_steps, found.histories, plain.histories, strict=True
-    ):
-        assert taken.shape == (int(count),)
-        assert (taken > 0).all()
-        end = int(count) + 1
-        assert jnp.allclose(history.cost[:end], same.cost[:end], rtol=1e-9)
-    assert jnp.allclose(found.state.cameras, plain.state.cameras, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -941,7 +921,7 @@ def test_a_solve_that_takes_no_step_is_refused():
 def test_a_damping_that_is_none_is_refused(damping):
     problem, _, start = make()
     costs = functools.partial(trace, observe=problem.cost)
-    for used in (solve, clock, costs):
+    for used in (solve, costs):
         with pytest.raises(ValueError, match=f"damping: {damping}, expected 0 or more"):
             used(problem, start, damping=damping)
 
@@ -949,11 +929,11 @@ def test_a_damping_that_is_none_is_refused(damping):
 def test_watched_solves_refuse_what_a_solve_refuses():
     problem, _, start = make()
     other = dataclasses.replace(start, landmarks=start.landmarks[:-1])
-    for used in (clock, functools.partial(trace, observe=problem.cost)):
-        with pytest.raises(ValueError, match="state.landmarks: shape"):
-            used(problem, other)
-        with pytest.raises(ValueError, match="schedule: no stage"):
-            used(problem, start, schedule=())
+    used = functools.partial(trace, observe=problem.cost)
+    with pytest.raises(ValueError, match="state.landmarks: shape"):
+        used(problem, other)
+    with pytest.raises(ValueError, match="schedule: no stage"):
+        used(problem, start, schedule=())
 
 
 @pytest.mark.slow

@@ -30,6 +30,8 @@ from bodyslam_jax.types import JointEstimate, Result
 
 _AXES = 3
 """Coordinates over which the squared error of a joint is spread."""
+_LEVEL = [0, 2]
+"""Horizontal axes of W."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,42 +62,52 @@ def place_uncertainty(
     Args:
         joint: the optimum of which `result` is the metric, upright version.
         joint_sigma: expected error of joints within the body, m.
-        sizes: relative standard deviation of the size of each person.
-        scale_sigma: standard deviation of the scale as reported, m per unit of the map.
+        sizes: relative standard deviation of the stature of each person.
+        scale_sigma: standard deviation of the scale as reported, m per unit of the map;
+            0 with a camera that does not move, whose height is as sure as the size of
+            people.
         up_sigma: standard deviation of the vertical, rad.
         focal_sigma: relative standard deviation of the focal length.
     """
     covariance = joint.root_covariance
     if covariance is None or not np.isfinite([scale_sigma, up_sigma]).all():
         return None
-    more = np.nan_to_num(scale_sigma**2 - joint.scale_sigma**2) / result.scale**2
     present = result.present
     pelvis = result.joints[:, :, PELVIS]
     eye = result.T_WC[0, :3, 3]
-    turn = result.T_WC[0, :3, :3] @ joint.cameras[0, :3, :3].T
+    floor = _middle_of_stances(joint, result)
     to = pelvis - eye
+    turn = result.T_WC[0, :3, :3] @ joint.cameras[0, :3, :3].T
     variance = np.einsum("ab,htbc,ac->hta", turn, covariance, turn)
-    variance = variance + max(more, 0.0) * to**2
+    # With a camera that does not move, the covariance has no scale: NaN, no more of it.
+    more = np.nan_to_num(scale_sigma**2 - joint.scale_sigma**2) / result.scale**2
+    variance += max(more, 0.0) * to**2
     view = result.T_WC[:, :3, 2]
     along = np.einsum("hta,ta->ht", to, view)[..., None] * view
-    variance = variance + (focal_sigma * along) ** 2
-    across = up_sigma * to[..., 1]
-    variance[..., 0] += across**2
-    variance[..., 2] += across**2
-    standing = toes_standing(joint.contacts)
-    feet = result.joints[:, :, list(FEET)]
-    stances = np.concatenate(
-        [np.zeros((0, 3)), *find_stances(feet, present, result.fps, standing)]
+    variance += (focal_sigma * along) ** 2
+    variance[..., _LEVEL] += (up_sigma * to[..., 1:2]) ** 2
+    # Feet define the floor: of the height above it the legs' length and posture err.
+    ankles = (joint_sigma[..., list(ANKLES)] ** 2).mean(axis=-1)
+    tilted = lambda at: up_sigma * np.linalg.norm((at - floor)[..., _LEVEL], axis=-1)
+    legs = sizes[:, None] * pelvis[..., 1]
+    variance[..., 1] = legs**2 + tilted(pelvis) ** 2 + ankles / _AXES
+    variance += joint_sigma[..., PELVIS, None] ** 2 / _AXES
+    size = scale_sigma / result.scale
+    if not size and present.any():
+        size = np.nanmin(sizes)
+    return PlaceUncertainty(
+        root_sigma=np.where(present[..., None], np.sqrt(variance), 0.0),
+        camera_height=float(np.hypot(size * eye[1], tilted(eye))),
     )
-    if not len(stances):
-        stances = feet[present].reshape(-1, 3)
-    floor = np.median(stances, axis=0) if len(stances) else np.full(3, np.nan)
-    level = [0, 2]
-    tilted = lambda at: up_sigma * np.linalg.norm((at - floor)[..., level], axis=-1)
-    posture = (joint_sigma[..., list(ANKLES)] ** 2).mean(axis=-1) / _AXES
-    tall = sizes[:, None] * pelvis[..., 1]
-    variance[..., 1] = tall**2 + tilted(pelvis) ** 2 + posture
-    variance = variance + joint_sigma[..., PELVIS, None] ** 2 / _AXES
-    root_sigma = np.where(present[..., None], np.sqrt(variance), 0.0)
-    size = np.nan if not present.any() else np.nanmin(sizes)
-    return PlaceUncertainty(root_sigma, float(np.hypot(size * eye[1], tilted(eye))))
+
+
+def _middle_of_stances(joint: JointEstimate, result: Result) -> Float[np.ndarray, " 3"]:
+    """Returns the median place of standing feet, of all feet if none stand, m; NaN
+    without people."""
+    feet = result.joints[:, :, list(FEET)]
+    standing = toes_standing(joint.contacts)
+    stances = find_stances(feet, result.present, result.fps, standing)
+    places = np.concatenate([np.zeros((0, 3)), *stances])
+    if not len(places):
+        places = feet[result.present].reshape(-1, 3)
+    return np.median(places, axis=0) if len(places) else np.full(3, np.nan)

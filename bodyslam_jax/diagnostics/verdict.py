@@ -133,19 +133,19 @@ def assess(
         )
         people = with_doubts(people, doubts)
         of_world = doubts.of_whole
-    sizes = [
-        scale_sigma / abs(result.scale)
-        if cameras.kind == "moving"
-        else (person.stature_sigma or np.nan) / (person.stature or np.nan)
+    statures = [
+        (person.stature_sigma or np.nan) / (person.stature or np.nan)
         for person in people
     ]
+    moving = cameras.kind == "moving"
+    sizes = [scale_sigma / abs(result.scale)] * len(people) if moving else statures
     lengths = accuracy(sequence, cameras, result, up, sizes, config.structure)
     places = place_uncertainty(
         joint,
         result,
         found.joint_sigma,
-        np.array(sizes),
-        scale_sigma=scale_sigma if cameras.kind == "moving" else 0.0,
+        np.array(statures),
+        scale_sigma=scale_sigma if moving else 0.0,
         up_sigma=lengths.up,
         focal_sigma=lengths.focal,
     )

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.evaluation.errors import Trajectories
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.types import Result
+from bodyslam_jax.types import DEFAULT_FPS, Result
 
 _MAX_FILLED_FRAMES = 101
 """Number of steps that a gap in the timestamps is divided into at most."""
@@ -76,7 +76,7 @@ def samples_of(result: Result, feet: Float[np.ndarray, "h t f 3"]) -> Samples:
 
 def interval_of(times: Float[np.ndarray, " t"]) -> float:
     """Returns the median time between frames, s; 1/30 for a single frame."""
-    return float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
+    return float(np.median(np.diff(times))) if len(times) > 1 else 1 / DEFAULT_FPS
 
 
 def without_holes(times: Float[np.ndarray, " t"]) -> Float[np.ndarray, " u"]:

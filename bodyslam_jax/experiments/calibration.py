@@ -104,7 +104,7 @@ def jobs(experiment: Experiment, config: Config, stages: Path) -> list[Job]:
             )
             seconds = COMPILATION_S + 0.4 * (settings.length or 0)
             key = (settings, floor, which, config)
-            found.append(Job(label, key, seconds, compute, {"sequence": str, **FORM}))
+            found.append(Job(label, key, seconds, compute))
     return found
 
 

@@ -41,8 +41,6 @@ class Job:
     seconds: float
     """Estimated processor time, s."""
     compute: Callable[[], Row]
-    form: Any
-    """Form that a cached row must have for the report (`fits`)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,21 +109,15 @@ def by_sequence(
     families: Sequence[str],
     compute: Callable[[Case], Row],
     effort: tuple[float, float],
-    form: dict[str, Any],
 ) -> list[Job]:
     """Returns one row per sequence; `effort` is the number of solves and of compiled
-    problems.
-
-    `form` lists the fields of a row beside its sequence.
-    """
+    problems."""
     case = cases(config, stages)
 
     def job(settings: Simulation) -> Job:
         name = named(settings)
         run = lambda: {"sequence": name, **compute(case(settings))}
-        seconds = cost(settings, *effort)
-        full = {"sequence": name, **form}
-        return Job(name, (settings, config), seconds, run, full)
+        return Job(name, (settings, config), cost(settings, *effort), run)
 
     return [job(s) for s in simulations(experiment, sequences, families)]
 
@@ -144,11 +136,8 @@ class Journal:
         words = re.sub(r"[^A-Za-z0-9.]+", "_", label).strip("_")
         return self.folder / f"{name}-{words}-{fingerprint(name, label, *key)}.json"
 
-    def kept(
-        self, name: str, label: str, key: Sequence[Any], form: Any = dict
-    ) -> Row | None:
-        """Returns the row of this `key` if it is on disk and has that `form` (`fits`),
-        else `None`."""
+    def kept(self, name: str, label: str, key: Sequence[Any]) -> Row | None:
+        """Returns the row of this `key` if it is on disk, else `None`."""
         path = self.path(name, label, *key)
         if not path.exists():
             return None
@@ -156,7 +145,7 @@ class Journal:
             found = files.read_json(path, "a row of an experiment")
         except InputError:
             return None
-        return found if fits(found, form) else None
+        return found if isinstance(found, dict) else None
 
     def row(
         self,
@@ -164,11 +153,10 @@ class Journal:
         label: str,
         key: Sequence[Any],
         compute: Callable[[], Row],
-        form: Any = dict,
     ) -> Row:
         """Returns the row of this `key`, from disk if present; `label` is used in the
         log."""
-        found = self.kept(name, label, key, form)
+        found = self.kept(name, label, key)
         if found is not None:
             log.info("%s %s: taken from an earlier run", name, label)
             return found
@@ -182,27 +170,6 @@ class Journal:
         self.folder.mkdir(parents=True, exist_ok=True)
         atomic.write_text(path, json.dumps(row, indent=1))
         return row
-
-
-def fits(value: Any, form: Any) -> bool:
-    """Returns whether a JSON value has a form: a type, a fixed text, or parts with
-    forms.
-
-    `{"a": float}` has at least an `a`, `[float]` any number of items. A number that was
-    not finite is stored as `None`, which fits `float`.
-    """
-    if isinstance(form, dict):
-        return isinstance(value, dict) and all(
-            name in value and fits(value[name], one) for name, one in form.items()
-        )
-    if isinstance(form, list):
-        return isinstance(value, list) and all(fits(item, form[0]) for item in value)
-    if isinstance(form, str):
-        return value == form
-    if form is float:
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        return value is None or number
-    return isinstance(value, form)
 
 
 def _plain(value: Any) -> Any:

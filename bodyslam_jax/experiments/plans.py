@@ -38,7 +38,7 @@ from bodyslam_jax.experiments.paper import STRUCTURE
 from bodyslam_jax.experiments.reports import about
 from bodyslam_jax.experiments.scale import PERTURBATIONS, scale_recovery
 from bodyslam_jax.experiments.scenario import simulations
-from bodyslam_jax.experiments.table1 import FORM, write_table1
+from bodyslam_jax.experiments.table1 import write_table1
 from bodyslam_jax.experiments.video_table import write_video
 from bodyslam_jax.pipeline.case import Case
 from bodyslam_jax.pipeline.stage_cache import body_model_file
@@ -59,7 +59,6 @@ def table1(experiment: Experiment, config: Config, stages: Path) -> Plan:
         ("room", "follow"),
         compare_methods,
         (3.0, 6.0),
-        FORM,
     )
     return Plan(jobs, functools.partial(write_table1, about=about(experiment, config)))
 
@@ -84,7 +83,6 @@ def scale(experiment: Experiment, config: Config, stages: Path) -> Plan:
         ("room",),
         compute,
         (len(PERTURBATIONS) * 1.5, 3.0),
-        reports.SCALE_FORM,
     )
     data = about(experiment, config)
     return Plan(jobs, functools.partial(reports.write_scale, about=data))
@@ -101,7 +99,6 @@ def landmarks(experiment: Experiment, config: Config, stages: Path) -> Plan:
         ("room",),
         functools.partial(landmark_ablation, seed=experiment.seed or 0),
         (2.5, 4.0),
-        reports.STRUCTURE_FORM,
     )
     data = about(experiment, config)
     return Plan(jobs, functools.partial(reports.write_structure, about=data))
@@ -125,7 +122,7 @@ def motion_model(experiment: Experiment, config: Config, stages: Path) -> Plan:
 
     model = config.motion_model and Path(config.motion_model)
     key = (Path(source), model, body_model_file(config.body_model))
-    return Plan([Job("motion", key, 60.0, compute, reports.MOTION_FORM)], write)
+    return Plan([Job("motion", key, 60.0, compute)], write)
 
 
 def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
@@ -148,8 +145,7 @@ def ablation(experiment: Experiment, config: Config, stages: Path) -> Plan:
             seconds -= cost(settings, 0.0, 0.0)  # stages before the solve are cached
         begun.add(settings)
         key = (settings, config, *extra)
-        form = {"sequence": name, "label": label, "status": str}
-        jobs.append(Job(f"{name}-{label}", key, seconds, row, form))
+        jobs.append(Job(f"{name}-{label}", key, seconds, row))
 
     for s in simulations(experiment, ("M2", "D1"), ("room",)):
         for v in VARIANTS:
@@ -231,9 +227,7 @@ def run_experiment(
     plan = PLANS[name](experiment, config, out / "stages")
     journal = Journal(out / "rows")
     missing = [
-        job
-        for job in plan.jobs
-        if journal.kept(name, job.label, job.key, job.form) is None
+        job for job in plan.jobs if journal.kept(name, job.label, job.key) is None
     ]
     minutes = sum(job.seconds for job in missing) / 60
     log.info(
@@ -256,11 +250,11 @@ def run_experiment(
     written: list[Path] = []
     for job in plan.jobs:
         if engine is not None:
-            row = journal.kept(name, job.label, job.key, job.form)
+            row = journal.kept(name, job.label, job.key)
             rows += [] if row is None else [row]
             continue
         try:
-            rows.append(journal.row(name, job.label, job.key, job.compute, job.form))
+            rows.append(journal.row(name, job.label, job.key, job.compute))
         except (FileNotFoundError, ValueError) as error:
             log.warning("%s %s: left out: %s", name, job.label, error)
             continue
@@ -276,7 +270,7 @@ def compute_row(
 ) -> None:
     """Computes one row of an experiment into `out/rows`, in any process."""
     job = _plan(name, out, experiment, config).jobs[number]
-    Journal(out / "rows").row(name, job.label, job.key, job.compute, job.form)
+    Journal(out / "rows").row(name, job.label, job.key, job.compute)
 
 
 @functools.lru_cache(maxsize=1)

@@ -27,25 +27,6 @@ from bodyslam_jax.experiments.tables import (
 )
 from bodyslam_jax.pipeline.stage_cache import body_model_file
 
-SCALE_FORM = {
-    **dict.fromkeys(("perturbation", "scale", "deviation"), [float]),
-    **dict.fromkeys(("history", "h_ate"), [[float]]),
-    "spread": float,
-}
-_STAGE_NAMES = ("original", "start", "perturbed", "no_landmarks", "landmarks")
-STRUCTURE_FORM = {
-    **dict.fromkeys(_STAGE_NAMES, float),
-    **{f"{stage}/scale": float for stage in _STAGE_NAMES},
-    **dict.fromkeys(("status", "status_no_landmarks"), str),
-}
-MOTION_FORM = {
-    "rows": [{"model": str, "drift": float, "class": str, "error_mm": float}],
-    "clips": int,
-    "held_out": bool,
-}
-"""Fields, with their types, that cached rows must have for the reports below, as for
-the other forms above (`jobs.fits`)."""
-
 
 def write_scale(out: Path, rows: list[Row], *, about: str) -> list[Path]:
     """Writes the report on scale recovery.

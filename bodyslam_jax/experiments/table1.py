@@ -4,11 +4,9 @@ values."""
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from bodyslam_jax.experiments import figures, paper
 from bodyslam_jax.experiments.comparison import METHODS
-from bodyslam_jax.experiments.scenario import NAMES, PLAUSIBILITY_FIGURES
 from bodyslam_jax.experiments.tables import (
     MM,
     Column,
@@ -24,27 +22,6 @@ _PAPER_METHODS = {"no_mm": "no MM", "full": "full"}
 """The methods that the paper compares."""
 _PAPER_PREFIX = "paper:"
 """Prefix of the keys of the paper's values in our rows."""
-_NUMBER_FIELDS = (
-    "frames",
-    "radius",
-    "start_ratio",
-    "start_sigma",
-    "scale_ratio",
-    "steps",
-)
-_PATH_FORM = [[float]]
-FORM: dict[str, Any] = {
-    **dict.fromkeys(_NUMBER_FIELDS, float),
-    **{f"{method}/{name}": float for method in METHODS for name in NAMES},
-    **{f"full/{name}": float for name in PLAUSIBILITY_FIGURES},
-    "status": str,
-    "paths": {
-        f"{what}/{name}": _PATH_FORM
-        for what in ("camera", "human")
-        for name in ("truth", *_PAPER_METHODS)
-    },
-}
-"""Fields of a cached row beside its sequence, and their types (`jobs.fits`)."""
 _SEQUENCE_COLUMN = Column("sequence", "sequence")
 _DETAIL_COLUMNS = [
     Column("frames", "frames", digits=0),

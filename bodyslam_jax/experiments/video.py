@@ -39,11 +39,6 @@ FIGURES = (
     *("scale", "pa_mpjpe", "gravity_error", *evaluation.FIGURES),
     *(f"{name}_of_truth" for name in evaluation.FIGURES),
 )
-FORM: dict[str, Any] = {
-    **dict.fromkeys((*FIGURES, "size"), float),
-    "status": str,
-}
-"""Fields of a cached row beside its sequence, and their types (`jobs.fits`)."""
 _SECONDS_PER_FRAME = 0.6
 """Processor time of all stages per frame and input, s."""
 _READOUT_S = 0.015
@@ -67,12 +62,9 @@ def jobs(
         settings = filmed(plain)
         for which in INPUTS:
             label = f"{named(settings)}-{which}"
-            form = {"sequence": named(settings), **FORM, "input": which}
-            if settings.motion == OTHER:
-                form["motion"] = what_is_done(settings)
             seconds = COMPILATION_S + _SECONDS_PER_FRAME * (settings.length or FRAMES)
             one = functools.partial(video_row, settings, which, config, stages)
-            out.append(Job(label, (settings, which, config), seconds, one, form))
+            out.append(Job(label, (settings, which, config), seconds, one))
     return out
 
 

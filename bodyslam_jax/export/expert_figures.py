@@ -52,7 +52,8 @@ def people_table(
         return ""
     rows = [[name, *(column[name] for column in columns)] for name in columns[0]]
     note = (
-        "<p>Ways are over the ground, smoothed over half a second. The stature is "
+        "<p>Places are as seen from the first camera, with one standard deviation. "
+        "Ways are over the ground, smoothed over half a second. The stature is "
         "barefoot, from the estimated shape. The lower foot (its joint, median) of a "
         "real walk moves at about 10 cm/s. What was not measured was hidden, out of "
         "the image or uncertain to the detector: the posture is inferred there.</p>"

@@ -55,7 +55,7 @@ def _inflation(sequence: Sequence, weights: GraphWeights) -> float:
     the frame rate of the sequence."""
     if weights.keypoint_sigma is not None:
         return 1.0
-    return weights.keypoint_inflation * float(np.sqrt(sequence.fps / 30.0))
+    return weights.keypoint_inflation * float(np.sqrt(sequence.fps / motion.FPS))
 
 
 def _keypoint_loss(
@@ -109,7 +109,7 @@ def people_factors(
                 loss=_keypoint_loss(sequence, sigma, weights),
             )
         )
-    per_frame = 30.0 / sequence.fps
+    per_frame = motion.FPS / sequence.fps
     between = lambda rho: graph.ar1_correlation(present, rho**per_frame)
     where = lambda mask, sigma: jnp.where(mask, sigma, jnp.inf)
     with_prior = present
@@ -258,7 +258,7 @@ def contact_factor(
         (present & np.asarray(_previous_frame(present)))[..., None], both, 0.0
     )
     leg = motion.leg_length(body, state.shapes)[:, None, None]
-    sigma = weights.contact_sigma * np.sqrt(30.0 / fps) * leg
+    sigma = weights.contact_sigma * np.sqrt(motion.FPS / fps) * leg
     stands = both > _MIN_CONTACT_PROBABILITY
     sigma = jnp.where(stands, sigma / jnp.sqrt(jnp.where(stands, both, 1.0)), jnp.inf)
     shape = jnp.broadcast_to(state.shapes[:, None], (*present.shape, 10))

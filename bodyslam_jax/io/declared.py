@@ -17,6 +17,8 @@ from bodyslam_jax.io import budget
 MAX_MAGNITUDE = 1e12
 """Largest absolute value of a measurement. Its square times a million still fits
 float32."""
+MAX_QUATERNION_ERROR = 0.05
+"""Largest deviation of the length of a quaternion from 1; chosen, not measured."""
 Kind = Literal["number", "whole", "boolean"]
 Shape = Sequence[int | str | None]
 """Length of each axis: a number, a name that stands for the same number throughout a

@@ -32,7 +32,14 @@ from bodyslam_jax.io.video import (
     list_images,
     look_at,
 )
-from bodyslam_jax.types import DetectedPeople, Intrinsics, Sequence, Tracks
+from bodyslam_jax.types import (
+    DEFAULT_FPS,
+    DetectedPeople,
+    Intrinsics,
+    Sequence,
+    Tracks,
+    mean_rate,
+)
 
 _log = logging.getLogger(__name__)
 _MIN_RATE = 8.0
@@ -40,8 +47,6 @@ _MIN_RATE = 8.0
 four frames."""
 _RATE_TOLERANCE = 0.02
 """Relative difference of the frame rates of camera.json and of the video."""
-_DEFAULT_RATE = 30.0
-"""Frame rate where no file has one, 1/s."""
 _ASPECT_TOLERANCE = 0.01
 """Difference of an aspect ratio from 1 up to which it counts as 1."""
 _TIME_TOLERANCE_S = 1e-6
@@ -117,12 +122,12 @@ def _read_parts(
         num_frames = footage.num_read
     else:
         if fps is None:
-            fps = _DEFAULT_RATE
+            fps = DEFAULT_FPS
             warn("camera.json has no fps: 30 frames/s assumed.")
         num_frames = _count_frames(parts, tracks, intrinsics, fps, config)
         timestamps, picks = np.arange(num_frames) / fps, None
     times = times_of_all_frames(timestamps, picks, num_frames)
-    rate = _mean_rate(timestamps)
+    rate = mean_rate(timestamps)
     if rate < _MIN_RATE:
         warn(
             f"{rate:.3g} frames/s: the motion model, of 30 frames/s, is inaccurate for "
@@ -315,16 +320,9 @@ def _check_size(parts: Parts, intrinsics: Intrinsics, footage: Footage) -> None:
 def _check_rate(fps: float | None, footage: Footage, warn: Warn) -> None:
     if fps is None or len(footage.timestamps) < 2:
         return
-    rate = _mean_rate(footage.timestamps)
+    rate = mean_rate(footage.timestamps)
     if abs(rate - fps) > _RATE_TOLERANCE * fps:
         warn(f"camera.json has {fps:g} frames/s, the video {rate:.4g}: video used.")
-
-
-def _mean_rate(timestamps: np.ndarray) -> float:
-    """Returns the mean frame rate, 1/s; 30 for a single frame."""
-    if len(timestamps) < 2:
-        return _DEFAULT_RATE
-    return (len(timestamps) - 1) / (timestamps[-1] - timestamps[0])
 
 
 def _count_frames(

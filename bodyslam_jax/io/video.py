@@ -24,7 +24,7 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.io.budget import check_pixels
 from bodyslam_jax.io.images import read_image
-from bodyslam_jax.types import Sequence
+from bodyslam_jax.types import DEFAULT_FPS, Sequence
 
 _log = logging.getLogger(__name__)
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -277,7 +277,7 @@ def resampled(
         return np.zeros(1), None, ()
     if not np.isfinite(times).all() or (step <= 0).any():
         if not 1 <= nominal <= 1000:
-            nominal = 30.0
+            nominal = DEFAULT_FPS
         warning = f"{path.name}: times do not increase; {nominal:g} frames/s taken."
         return np.arange(len(times)) / nominal, None, (warning,)
     median = float(np.median(step))
@@ -311,7 +311,7 @@ def _look_at_images(folder: Path, fps: float | None) -> Footage:
     height, width = _read_image(images[0], gray=True).shape
     warnings: tuple[str, ...] = ()
     if fps is None:
-        fps = 30.0
+        fps = DEFAULT_FPS
         warnings = (f"{folder.name}: frame rate not given, 30 frames/s assumed.",)
     times = np.arange(len(images)) / fps
     repeats = Repeats()

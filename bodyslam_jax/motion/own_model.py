@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.motion.capture.clips import FPS
 from bodyslam_jax.motion.network import Guess, MotionNetwork, Window
 from bodyslam_jax.motion.prediction import MotionModel
 
@@ -58,7 +59,7 @@ def make_motion_model(
     parameters: PyTree,
     *,
     body: BodyModel,
-    fps: float = 30.0,
+    fps: float = FPS,
     past: int = 1,
 ) -> MotionModel:
     """Makes a motion model that predicts with `step(parameters, window)`.

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.geometry import so3
 from bodyslam_jax.geometry.lengths import lengthened
+from bodyslam_jax.motion.capture.clips import FPS
 from bodyslam_jax.motion.contact_network import ContactModel, predict_contact
 from bodyslam_jax.motion.prediction import MotionModel, Prediction, predict
 
@@ -82,7 +83,7 @@ class Clock(eqx.Module):
 
 
 def make_clock(
-    timestamps: Float[np.ndarray, " t"], fps: float = 30.0, num_ticks: int | None = None
+    timestamps: Float[np.ndarray, " t"], fps: float = FPS, num_ticks: int | None = None
 ) -> Clock:
     """Aligns the ticks of a model, `fps` per second, with the timestamps (s) of a
     video.

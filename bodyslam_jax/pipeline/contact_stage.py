@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax import graph, initialisation
+from bodyslam_jax import graph, initialisation, motion
 from bodyslam_jax.body import BodyModel
 from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
@@ -145,7 +145,7 @@ def stand_on_plane(
     )
     near = used & (away < 3 * spread * _MAX_HEIGHT_SCATTER_M)
     # Of a frame of 1/30 s, constant over a stance: variances grow with the rate.
-    sigma = _HEIGHT_SIGMA_M * spread * np.sqrt(fps / 30.0)
+    sigma = _HEIGHT_SIGMA_M * spread * np.sqrt(fps / motion.FPS)
     sigma = np.where(near, sigma / np.sqrt(np.maximum(stands, 0.5)), np.inf)
     shifted = np.asarray(contact.offset) - offset / float(state.scale)
     return eqx.tree_at(

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
 
+from bodyslam_jax.body.skeleton import ANKLES, FEET
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.motion import FPS, Clip, resample
@@ -90,7 +91,7 @@ class Soles:
         self.person = person
         floor = person.skin[:, 1].min()
         self.offset = np.empty((2, 2, 3))
-        for i, (ankle, toe) in enumerate(((7, 10), (8, 11))):
+        for i, (ankle, toe) in enumerate(zip(ANKLES, FEET)):
             foot = person.skin[person.weights[:, ankle] > 0.5]
             heel = foot[foot[:, 2].argmin()] + [0.0, 0.0, 0.02]
             for k, point in enumerate((heel, person.rest[toe])):
@@ -156,7 +157,7 @@ class _Library:
         """Bends toes that would penetrate the floor, because toes are rigid in the
         recordings."""
         G, x = person.joints(self.poses, self.pelvis)
-        for ankle, toe in ((7, 10), (8, 11)):
+        for ankle, toe in zip(ANKLES, FEET):
             tips = np.flatnonzero(person.weights[:, toe] > 0.9)
             tip = person.skin[tips[person.skin[tips, 2].argmax()]] - person.rest[toe]
             tip[1] = person.skin[:, 1].min() - person.rest[toe, 1]

@@ -13,7 +13,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bodyslam_jax.body import KEYPOINT_SPREAD
-from bodyslam_jax.body.skeleton import ANKLES, FEET, HANDS, WRISTS
+from bodyslam_jax.body.skeleton import (
+    ANKLES,
+    BODY25,
+    FEET,
+    HANDS,
+    HEAD,
+    HIPS,
+    KNEES,
+    NECK,
+    PELVIS,
+    WRISTS,
+)
 from bodyslam_jax.config import Simulation
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.simulation.posing import Person
@@ -30,6 +41,11 @@ _LIMB_CAPSULES = (
 """Capsules that cover the body: two joints and a radius, m."""
 _POINTS_PER_M2 = 9.0
 """Points per m² of all surfaces."""
+_ARM = ("shoulder", "elbow", "wrist")
+_LEG = ("hip", "knee", "ankle", "big_toe", "small_toe", "heel")
+"""Keypoints that a detector exchanges together."""
+_TRUNK_RADIUS_M, _THIGH_RADIUS_M, _HEAD_RADIUS_M = 0.13, 0.07, 0.10
+"""Half widths of an adult's trunk, thigh and head, m."""
 _GRID_CELLS = (8, 6)
 _MAX_CANDIDATES = 700
 """Number of candidate points per image that are tested for visibility at most, to bound
@@ -192,11 +208,10 @@ def detect_keypoints(
         wrong, confidence * rng.uniform(0.25, 0.9, (t, 25)), confidence
     )
     swapped = _episodes(rng, (t, 2), noise.swap_rate / 2, 4.0)
-    pairs = (((2, 5), (3, 6), (4, 7)), ((9, 12), (10, 13), (11, 14)))
-    pairs = (pairs[0], (*pairs[1], (19, 22), (20, 23), (21, 24)))
-    for half, limbs in enumerate(pairs):
+    for half, parts in enumerate((_ARM, _LEG)):
         at = np.flatnonzero(swapped[:, half])[:, None]
-        for i, j in limbs:
+        for part in parts:
+            i, j = BODY25[f"right_{part}"], BODY25[f"left_{part}"]
             uv[at, [i, j]] = uv[at, [j, i]]
             confidence[at, [i, j]] = confidence[at, [j, i]]
     lost = _episodes(rng, (t, 1), noise.gap_rate, 6.0)
@@ -210,7 +225,12 @@ def detect_keypoints(
 
 def _self_occlusion(p_C, joints_C, intrinsics) -> Bool[np.ndarray, "t 25"]:
     """Returns whether trunk, thigh or head is in front of a keypoint."""
-    bones = ((0, 12, 0.13), (1, 4, 0.07), (2, 5, 0.07), (12, 15, 0.10))
+    thighs = ((hip, knee, _THIGH_RADIUS_M) for hip, knee in zip(HIPS, KNEES))
+    bones = (
+        (PELVIS, NECK, _TRUNK_RADIUS_M),
+        *thighs,
+        (NECK, HEAD, _HEAD_RADIUS_M),
+    )
     uv, at = project(p_C, intrinsics), project(joints_C, intrinsics)
     hidden = np.zeros(p_C.shape[:2], bool)
     for a, b, radius in bones:

@@ -8,7 +8,6 @@ of a solution.
 
 from bodyslam_jax.solver.batching import vmap_over_devices as vmap_over_devices
 from bodyslam_jax.solver.compilation import quick_options as quick_options
-from bodyslam_jax.solver.convergence_trace import clock as clock
 from bodyslam_jax.solver.convergence_trace import trace as trace
 from bodyslam_jax.solver.covariance import Marginals as Marginals
 from bodyslam_jax.solver.covariance import marginals as marginals

@@ -1,22 +1,19 @@
-"""Solves that record a function of the state, or the time, after each iteration."""
+"""Solves that record a function of the state after each iteration."""
 
-import time
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 
 from bodyslam_jax.geometry.lengths import is_traced
 from bodyslam_jax.graph import Problem, State
 from bodyslam_jax.solver.batching import sequential_vmap
-from bodyslam_jax.solver.compilation import in_full_precision, quick_jit
+from bodyslam_jax.solver.compilation import in_full_precision
 from bodyslam_jax.solver.levenberg_marquardt import lifted
 from bodyslam_jax.solver.padding import pad, unpad
-from bodyslam_jax.solver.solution import Solution, only, outcome
 from bodyslam_jax.solver.solve import (
     Stage,
     check_schedule,
@@ -24,7 +21,6 @@ from bodyslam_jax.solver.solve import (
     is_mixed,
     method_of,
     restrict,
-    restrict_to_all,
 )
 
 
@@ -91,64 +87,6 @@ def _stage(problem, state, see, stage, damping, mixed):
     carry = state, arrays, jnp.array(False)
     (state, _, _), seen = jax.lax.scan(one, carry, length=stage.max_steps)
     return state, seen
-
-
-def clock(
-    problem: Problem,
-    state: State,
-    *,
-    schedule: tuple[Stage, ...] = (Stage(),),
-    damping: float = 1e-4,
-    mixed_precision: bool | None = None,
-) -> tuple[Solution, tuple[np.ndarray, ...]]:
-    """Solves as `solve` does, and returns the wall time of each iteration, s, by stage.
-
-    `solve` itself is one compiled loop in which no clock can be read: a call back to
-    Python would wait for each step, and its program could be neither mapped nor cached
-    between runs. Here the same step is a program of its own, called from Python,
-    compiled before the clock runs; only passing the loop's state in and out comes on
-    top.
-
-    **Raises:** `ValueError` as `solve`.
-    """
-    _check(problem, state, schedule, damping)
-    t, l = len(state.cameras), len(state.landmarks)
-    problem, start = pad(problem, state)
-    problem = restrict_to_all(problem, schedule)
-    dtype = state.scale.dtype
-    method = method_of(schedule, damping, dtype, mixed=is_mixed(mixed_precision, state))
-    loop = _begin(method, problem, start)
-    arrays, static = eqx.partition(loop, eqx.is_array)
-    program = (
-        quick_jit(_advance).lower(method, problem, start, arrays, static).compile()
-    )
-    seconds: list[list[float]] = [[] for _ in schedule]
-    y = start
-    while not bool(arrays.finished):
-        stage, before = int(arrays.stage), time.perf_counter()
-        y, arrays = program(method, problem, y, arrays, static)
-        jax.block_until_ready(arrays)
-        if stage < len(seconds):  # else it only tells the cost where they ended
-            seconds[stage].append(time.perf_counter() - before)
-    loop = eqx.combine(arrays, static)
-    _, _, stats = method.postprocess(
-        _residuals, y, None, problem, {}, loop, frozenset(), loop.result
-    )
-    solution, _ = outcome(start, y, loop.result, stats)
-    solution = eqx.tree_at(lambda s: s.state, solution, unpad(solution.state, t, l))
-    return only(solution, len(schedule)), tuple(np.asarray(x) for x in seconds)
-
-
-@eqx.filter_jit
-def _begin(method, problem, state):
-    return method.init(_residuals, state, problem, {}, None, None, frozenset())
-
-
-@in_full_precision
-def _advance(method, problem, state, arrays, static):
-    loop = eqx.combine(arrays, static)
-    y, loop, _ = method.step(_residuals, state, problem, {}, loop, frozenset())
-    return y, eqx.filter(loop, eqx.is_array)
 
 
 def _residuals(state, problem):

@@ -320,7 +320,7 @@ def lifted(state: State, problem: Problem) -> list[Array]:
 class History(eqx.Module):
     """One row an iteration, of which the first `num_steps` are filled.
 
-    Times are not recorded: the loop is one compiled program (see `clock`).
+    Times are not recorded: the loop is one compiled program.
     """
 
     cost: Float[Array, "*s _"]

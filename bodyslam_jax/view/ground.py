@@ -10,7 +10,7 @@ from bodyslam_jax.geometry.arrays import runs
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.ground.stances import standing_feet
 from bodyslam_jax.types import Result
-from bodyslam_jax.view.style import PEOPLE, Image
+from bodyslam_jax.view.style import PEOPLE, SUBPIXELS, Image
 
 _GRID_MARGIN_M = 3.0
 """Grid beyond the outermost positions of cameras and people, m."""
@@ -110,4 +110,4 @@ def _grid(result: Result) -> Float[np.ndarray, "n m 3"]:
 def _sixteenths(uv: Float[np.ndarray, "n 2"]) -> np.ndarray:
     """Returns pixels in sixteenths of a pixel, as OpenCV draws them; points far outside
     the image are clipped, as they would overflow in OpenCV."""
-    return np.round(np.clip(uv, -4000, 4000) * 16).astype(np.int32)
+    return np.round(np.clip(uv, -4000, 4000) * SUBPIXELS).astype(np.int32)

@@ -13,6 +13,8 @@ from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.types import Result, Tracks
 from bodyslam_jax.view.style import (
     CAMERA,
+    POINT,
+    SUBPIXELS,
     Color,
     Image,
     blend_inset,
@@ -40,7 +42,6 @@ _LIMBS = (
     (0, 2, 5, 8, 11),
     (22, 20, 18, 16, 13, 9, 14, 17, 19, 21, 23),
 )
-_POINT_COLOR = (90, 230, 120)
 
 
 class Insets:
@@ -174,7 +175,7 @@ class SideView:
             for limb in limbs:
                 polylines(inset, limb, style.faint, 2, style.dash and (4, 4))
             middle, radius = head_ball(r.joints[h, frame])
-            round_head = 16 * max(round(float(radius) * self.zoom), 2)
+            round_head = SUBPIXELS * max(round(float(radius) * self.zoom), 2)
             place = at(middle[None])[0].tolist()
             cv2.circle(inset, place, round_head, style.faint, -1, cv2.LINE_AA, 4)
         if r.located[frame]:
@@ -192,7 +193,7 @@ class SideView:
         u = self.width / 2 + self.zoom * (p @ self.along - centre)
         v = self.height - 5 - self.zoom * (p[:, 1] - self.low)
         uv = np.clip(np.stack([u, v], axis=-1), -2000, 4000)
-        return np.round(uv * 16).astype(np.int32)
+        return np.round(uv * SUBPIXELS).astype(np.int32)
 
 
 def trails(tracks: Tracks | None, num_frames: int, zoom: np.ndarray) -> list[list]:
@@ -214,10 +215,10 @@ def trails(tracks: Tracks | None, num_frames: int, zoom: np.ndarray) -> list[lis
 
 
 def draw_trails(image: Image, lines: list[np.ndarray]) -> None:
-    curves = [np.round(trail * 16).astype(np.int32) for trail in lines]
-    cv2.polylines(image, curves, False, _POINT_COLOR, 1, cv2.LINE_AA, 4)
+    curves = [np.round(trail * SUBPIXELS).astype(np.int32) for trail in lines]
+    cv2.polylines(image, curves, False, POINT, 1, cv2.LINE_AA, 4)
     for line in curves:
-        cv2.circle(image, line[-1].tolist(), 2 * 16, _POINT_COLOR, -1, cv2.LINE_AA, 4)
+        cv2.circle(image, line[-1].tolist(), 2 * SUBPIXELS, POINT, -1, cv2.LINE_AA, 4)
 
 
 class Plan:
@@ -244,7 +245,7 @@ class Plan:
         """Returns positions in the inset, in sixteenths of a pixel: seen from above
         with z up the picture, x runs to the left."""
         uv = self.side / 2 - self.zoom * (points - self.centre)
-        return np.round(uv * 16).astype(np.int32)
+        return np.round(uv * SUBPIXELS).astype(np.int32)
 
     def _grid(self, extent: float) -> Image:
         inset = np.full((self.side, self.side, 3), 28, np.uint8)
@@ -289,7 +290,9 @@ class Plan:
                 spot = self._to_inset(place)[0].tolist()
                 style = self.styles[h]
                 fill = -1 if style.dash is None else 2
-                cv2.circle(inset, spot, 5 * 16, style.faint, fill, cv2.LINE_AA, 4)
+                cv2.circle(
+                    inset, spot, 5 * SUBPIXELS, style.faint, fill, cv2.LINE_AA, 4
+                )
         T = self.result.T_WC[frame]
         reach = 0.12 * self.side / self.zoom
         right, ahead = T[[0, 2], 0], T[[0, 2], 2]

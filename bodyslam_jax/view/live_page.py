@@ -15,22 +15,19 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from bodyslam_jax.body.skeleton import PARENTS
 from bodyslam_jax.view.serve import PageHandler, PageServer, local_server
+from bodyslam_jax.view.style import POINT
 
 _MAX_PATH_POINTS = 600
 """Points of a path; every second point of a longer one is dropped."""
 _MAX_WIDTH_PX = 960
 """Width of the widest picture, px."""
 _JPEG_QUALITY = 75
-_BONES = (
-    *((0, 1), (1, 4), (4, 7), (7, 10), (0, 2), (2, 5), (5, 8), (8, 11)),
-    *((0, 3), (3, 6), (6, 9), (9, 12), (12, 15)),
-    *((9, 13), (13, 16), (16, 18), (18, 20), (20, 22)),
-    *((9, 14), (14, 17), (17, 19), (19, 21), (21, 23)),
-)
+"""The default of libjpeg."""
+_BONES = tuple((parent, joint) for joint, parent in enumerate(PARENTS) if joint)
 _PERSON_COLORS = ((80, 170, 255), (255, 160, 80), (120, 220, 120), (220, 120, 220))
 """Colours of people by their number, BGR."""
-_POINT_COLOR = (90, 230, 120)
 
 
 @dataclasses.dataclass
@@ -135,7 +132,7 @@ def _drawn(
         picture = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     at = lambda uv: tuple(int(x) for x in np.clip(np.rint(uv * zoom), -9999, 9999))
     for uv in points:
-        cv2.circle(picture, at(uv), 1, _POINT_COLOR, -1, cv2.LINE_AA)
+        cv2.circle(picture, at(uv), 1, POINT, -1, cv2.LINE_AA)
     for person, uv, _ in people:
         colour = _PERSON_COLORS[person % len(_PERSON_COLORS)]
         for a, b in _BONES:

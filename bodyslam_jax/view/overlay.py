@@ -17,6 +17,7 @@ from bodyslam_jax.view.insets import Insets, draw_trails, trails
 from bodyslam_jax.view.people import Mesh, coarse_body, draw_people, meshes
 from bodyslam_jax.view.style import (
     PEOPLE,
+    SUBPIXELS,
     Image,
     Legend,
     person_styles,
@@ -187,8 +188,12 @@ class _KeypointMarks:
                     [self.of_detector[h, frame, k], self.of_body[h, frame, k]]
                 )
                 dot, ring = (
-                    np.round(np.clip(pair, -4000, 4000) * 16).astype(int).tolist()
+                    np.round(np.clip(pair, -4000, 4000) * SUBPIXELS)
+                    .astype(int)
+                    .tolist()
                 )
                 cv2.line(image, dot, ring, (255, 255, 255), 1, cv2.LINE_AA, 4)
-                cv2.circle(image, ring, 4 * 16, color, 1, cv2.LINE_AA, 4)
-                cv2.circle(image, dot, 2 * 16, (255, 255, 255), -1, cv2.LINE_AA, 4)
+                cv2.circle(image, ring, 4 * SUBPIXELS, color, 1, cv2.LINE_AA, 4)
+                cv2.circle(
+                    image, dot, 2 * SUBPIXELS, (255, 255, 255), -1, cv2.LINE_AA, 4
+                )

@@ -19,7 +19,14 @@ from bodyslam_jax.body import BodyModel, vertices
 from bodyslam_jax.diagnostics.reported_status import inferred_bones
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.types import Result
-from bodyslam_jax.view.style import PALE, Image, PersonStyle, person_styles, polylines
+from bodyslam_jax.view.style import (
+    PALE,
+    SUBPIXELS,
+    Image,
+    PersonStyle,
+    person_styles,
+    polylines,
+)
 
 _CELL_M = 0.025
 """Size of the cells in which vertices are merged, m."""
@@ -203,7 +210,7 @@ def draw_people(
     order = np.argsort(-np.concatenate(depth))
     triangles = np.concatenate(corners)[order]
     # Sixteenths of a pixel; far-off corners must not overflow in OpenCV.
-    triangles = np.round(np.clip(triangles, -4000, 4000) * 16).astype(np.int32)
+    triangles = np.round(np.clip(triangles, -4000, 4000) * SUBPIXELS).astype(np.int32)
     shades = np.concatenate(colors)[order].astype(int).tolist()
     here = sorted({mesh.person for mesh in people})[:255]
     number = {h: k + 1 for k, h in enumerate(here)}
@@ -229,7 +236,7 @@ def _outline(image: Image, mask: UInt8[np.ndarray, "y x"], style: PersonStyle) -
     for contour in contours:
         if len(contour) < _MIN_CONTOUR_PX:
             continue
-        curve = 16 * np.concatenate([contour, contour[:1]])[:, 0].astype(int)
+        curve = SUBPIXELS * np.concatenate([contour, contour[:1]])[:, 0].astype(int)
         width = 2 if np.ptp(contour[..., 1]) >= _MIN_WIDE_OUTLINE_HEIGHT_PX else 1
         polylines(image, curve, (20, 20, 20), width + 1, style.dash)
         polylines(image, curve, style.color, width, style.dash)

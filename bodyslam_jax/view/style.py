@@ -16,7 +16,10 @@ from bodyslam_jax.types import Result
 Image = UInt8[np.ndarray, "y x 3"]
 Color = tuple[int, int, int]
 """Blue, green, red; 0 to 255."""
+SUBPIXELS = 16
+"""OpenCV draws at coordinates with four binary places (`shift`)."""
 CAMERA: Color = (214, 111, 31)
+POINT: Color = (90, 230, 120)
 PEOPLE: tuple[Color, ...] = (
     (36, 110, 232),
     (115, 170, 40),
@@ -27,7 +30,7 @@ PEOPLE: tuple[Color, ...] = (
     (40, 190, 150),
     (70, 110, 170),
 )
-"""BGR, as in the report."""
+"""Of camera, tracked points and people, as in the report."""
 PALE = 0.8
 """Share of white in the colour of a limb that was inferred, not measured."""
 _LINE_HEIGHT_PX, _SAMPLE_LENGTH_PX = 17, 26
@@ -85,7 +88,7 @@ def _dashes(
     """Returns the parts of a curve that are drawn, with a point each pixel."""
     if len(curve) < 2:
         return []
-    step = np.linalg.norm(np.diff(curve, axis=0), axis=1) / 16
+    step = np.linalg.norm(np.diff(curve, axis=0), axis=1) / SUBPIXELS
     along = np.concatenate([[0.0], np.cumsum(step)])
     at = np.arange(0.0, along[-1], 1.0)
     points = np.stack([np.interp(at, along, axis) for axis in curve.T], axis=-1)
@@ -157,8 +160,8 @@ class Legend:
                 ends: Int[np.ndarray, "2 2"] = np.array(
                     [[x, y - 4], [x + _SAMPLE_LENGTH_PX, y - 4]]
                 )
-                polylines(image, 16 * ends, (0, 0, 0), 4, dash)
-                polylines(image, 16 * ends, (255, 255, 255), 2, dash)
+                polylines(image, SUBPIXELS * ends, (0, 0, 0), 4, dash)
+                polylines(image, SUBPIXELS * ends, (255, 255, 255), 2, dash)
                 left += _SAMPLE_LENGTH_PX + 7
             write_text(image, text, (left, y), 0.45)
             y -= _LINE_HEIGHT_PX

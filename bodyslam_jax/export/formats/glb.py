@@ -20,7 +20,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bodyslam_jax.body import JOINT_NAMES, PARENTS
-from bodyslam_jax.export.formats.scene import COLORS, Scene
+from bodyslam_jax.export.formats.scene import (
+    COLORS,
+    GRID_GREY,
+    GROUND_GREY,
+    GROUND_OPACITY,
+    MAP_GREY,
+    Scene,
+)
 from bodyslam_jax.geometry import so3_numpy as so3
 
 log = logging.getLogger(__name__)
@@ -52,7 +59,7 @@ def write(path: Path, scene: Scene) -> None:
     _add_camera(document, scene)
     if len(scene.result.landmarks):
         points = {"POSITION": document.positions(scene.result.landmarks)}
-        document.add_mesh("map", points, (0.35, 0.35, 0.35), mode=_POINTS_MODE)
+        document.add_mesh("map", points, 3 * (MAP_GREY,), mode=_POINTS_MODE)
     _add_ground(document, scene)
     document.write(path, scene.name)
 
@@ -256,9 +263,11 @@ def _add_ground(document: _Document, scene: Scene) -> None:
         return
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     surface = {"POSITION": document.positions(corners)}
-    document.add_mesh("ground", surface, (0.6, 0.6, 0.6, 0.3), faces=faces)
+    document.add_mesh(
+        "ground", surface, (*3 * (GROUND_GREY,), GROUND_OPACITY), faces=faces
+    )
     lines = {"POSITION": document.positions(scene.grid.reshape(-1, 3))}
-    document.add_mesh("ground_grid", lines, (0.3, 0.3, 0.3), mode=_LINES_MODE)
+    document.add_mesh("ground_grid", lines, 3 * (GRID_GREY,), mode=_LINES_MODE)
 
 
 def color_of(person: int) -> tuple[float, ...]:

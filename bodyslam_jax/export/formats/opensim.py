@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax.body import JOINT_NAMES, PARENTS
+from bodyslam_jax.body.skeleton import HEAD, NECK
 from bodyslam_jax.export.formats.csv import SMPL_TO_ISB
 from bodyslam_jax.export.formats.scene import Scene, at_constant_rate
 from bodyslam_jax.export.formats.trc import trc_text
@@ -111,9 +112,9 @@ SEGMENTS: tuple[Segment, ...] = (
     *_leg("r", 2, outward=False),
     *_leg("l", 1, outward=True),
     Segment("torso", "pelvis", 3, 9, _LUMBAR, (9, 12, 16, 17)),
-    Segment("head", "torso", 12, 15, _NECK, (15,)),
-    *_arm("r", 17, outward=False),
-    *_arm("l", 16, outward=True),
+    Segment("head", "torso", NECK, HEAD, _NECK, (HEAD,)),
+    *_arm("r", JOINT_NAMES.index("right_shoulder"), outward=False),
+    *_arm("l", JOINT_NAMES.index("left_shoulder"), outward=True),
 )
 TRANSLATIONS = ("pelvis_tx", "pelvis_ty", "pelvis_tz")
 """Coordinates of the pelvis joint's centre in the run's world, m."""

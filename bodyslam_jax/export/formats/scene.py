@@ -28,6 +28,8 @@ Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation from the run's world (y up) to one whose z axis is up: z becomes -y."""
 COLORS = ((232, 110, 36), (40, 170, 115), (150, 90, 200), (200, 160, 20))
 """Colours of people, sRGB, as in report and overlay."""
+MAP_GREY, GROUND_GREY, GRID_GREY, GROUND_OPACITY = 0.35, 0.6, 0.3, 0.3
+"""Greys of map, ground and its grid, 0 to 1, for programs that show exported scenes."""
 _MAX_FINE_GRID_M = 100.0
 """Length of the ground up to which its grid has a line per metre."""
 _MAX_TIMING_ERROR_FRAMES = 0.25

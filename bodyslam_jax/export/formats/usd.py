@@ -17,7 +17,12 @@ from bodyslam_jax.export.formats.glb import (
     quaternions,
     strongest,
 )
-from bodyslam_jax.export.formats.scene import Scene
+from bodyslam_jax.export.formats.scene import (
+    GROUND_GREY,
+    GROUND_OPACITY,
+    MAP_GREY,
+    Scene,
+)
 
 _APERTURE_WIDTH = 36.0
 """Width of the film back, tenths of a world unit; only its ratio to the focal length
@@ -55,15 +60,15 @@ def write(path: Path, scene: Scene) -> None:
         points.CreatePointsAttr(vectors(scene.result.landmarks))
         points.CreateWidthsAttr([0.02])
         points.SetWidthsInterpolation("constant")
-        points.CreateDisplayColorAttr([(0.35, 0.35, 0.35)])
+        points.CreateDisplayColorAttr([3 * (MAP_GREY,)])
     if scene.ground is not None:
         ground = UsdGeom.Mesh.Define(stage, "/World/ground")
         ground.CreatePointsAttr(vectors(scene.ground))
         ground.CreateFaceVertexCountsAttr([4])
         ground.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
         ground.CreateSubdivisionSchemeAttr("none")
-        ground.CreateDisplayColorAttr([(0.6, 0.6, 0.6)])
-        ground.CreateDisplayOpacityAttr([0.3])
+        ground.CreateDisplayColorAttr([3 * (GROUND_GREY,)])
+        ground.CreateDisplayOpacityAttr([GROUND_OPACITY])
     stage.GetRootLayer().Save()
 
 

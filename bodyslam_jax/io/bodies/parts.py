@@ -27,7 +27,7 @@ from bodyslam_jax.io.budget import MAX_PEOPLE
 from bodyslam_jax.io.declared import as_array
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.tracking.tracker import PointSet, identify
-from bodyslam_jax.types import Intrinsics
+from bodyslam_jax.types import DEFAULT_FPS, Intrinsics
 
 PELVIS_SMPL = np.array([-0.0018, -0.2233, 0.0282])
 """J_0 of SMPL's neutral template, m."""
@@ -139,7 +139,7 @@ class Video:
     @property
     def rate(self) -> float:
         """Frame rate, 1/s; 30 if it is not known."""
-        return self.fps or 30.0
+        return self.fps or DEFAULT_FPS
 
     def frames_in(self, seconds: float) -> int:
         """Returns the number of frames in so many seconds, at least 1."""

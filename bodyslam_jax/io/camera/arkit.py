@@ -15,7 +15,7 @@ from jaxtyping import Float
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera.colmap import FoundCamera
-from bodyslam_jax.io.declared import Fields, as_array, fields
+from bodyslam_jax.io.declared import MAX_QUATERNION_ERROR, Fields, as_array, fields
 from bodyslam_jax.io.files import (
     parse_json,
     read_csv,
@@ -131,7 +131,10 @@ def _poses(
     path: Path, xyzw: Float[np.ndarray, "n 4"], position: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 4 4"]:
     length = np.linalg.norm(xyzw, axis=1)
-    if not np.isfinite(position).all() or not (abs(length - 1) < 0.05).all():
+    if (
+        not np.isfinite(position).all()
+        or not (abs(length - 1) < MAX_QUATERNION_ERROR).all()
+    ):
         raise InputError(f"{path}: a pose that is no rotation and position.")
     T_WC = np.tile(np.eye(4), (len(xyzw), 1, 1))
     T_WC[:, :3, :3] = so3.from_quaternion(xyzw)

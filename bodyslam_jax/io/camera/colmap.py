@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
-from bodyslam_jax.io.declared import Fields, as_array, shown
+from bodyslam_jax.io.declared import MAX_QUATERNION_ERROR, Fields, as_array, shown
 from bodyslam_jax.io.files import read_bytes, read_json_fields, read_lines, reading
 
 _HALF_PIXEL = 0.5
@@ -83,7 +83,7 @@ def read_poses(path: Path) -> tuple[list[str], Float[np.ndarray, "n 4 4"]]:
     # A quaternion and a translation.
     numbers = as_array(path, "poses", list(numbers), (None, 7))
     length = np.linalg.norm(numbers[:, :4], axis=1)
-    if (abs(length - 1) > 0.05).any():
+    if (abs(length - 1) > MAX_QUATERNION_ERROR).any():
         raise InputError(f"{path}: a quaternion of length {length.max():.3g}, not 1.")
     R_CW = so3.from_quaternion(numbers[:, [1, 2, 3, 0]])
     T_WC = np.tile(np.eye(4), (len(numbers), 1, 1))

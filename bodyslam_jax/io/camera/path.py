@@ -14,7 +14,7 @@ from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry import so3_numpy as so3
 from bodyslam_jax.io.camera import arkit
 from bodyslam_jax.io.camera.colmap import read_poses
-from bodyslam_jax.io.declared import MAX_MAGNITUDE
+from bodyslam_jax.io.declared import MAX_MAGNITUDE, MAX_QUATERNION_ERROR
 from bodyslam_jax.io.files import read_lines
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.types import CameraPath, PathClock
@@ -262,7 +262,7 @@ def read_tum(path: Path) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t 
     if np.any(np.diff(table[:, 0]) <= 0):
         raise InputError(f"{path}: two poses have the same timestamp.")
     length = np.linalg.norm(table[:, 4:], axis=1)
-    if np.any(abs(length - 1) > 0.05):
+    if np.any(abs(length - 1) > MAX_QUATERNION_ERROR):
         worst = float(length[np.argmax(abs(length - 1))])
         raise InputError(f"{path}: a quaternion of length {worst:.3g}, not 1.")
     if np.abs(table[:, 1:4]).max() > MAX_MAGNITUDE:
