@@ -358,28 +358,24 @@ def evenly(record: Record, rate: float) -> tuple[list[Seen], Bool[np.ndarray, " 
     These are all that were used if they have even times; else one in so many of the
     source's frames as were used on average, but none in a gap of more than a second.
     """
-    used = record.frames
-    times = np.array([frame.time for frame in used])
+    times = np.array([frame.time for frame in record.frames])
     gaps = np.diff(times) * rate
     step = max(1, round(float(np.median(gaps)))) if len(gaps) else 1
     if not len(gaps) or np.abs(gaps - step).max() < 0.5:
-        return used, np.ones(len(used), bool)
+        return record.frames, np.ones(len(times), bool)
     short = gaps[gaps <= _MAX_FILLED_S * rate]
     step = max(1, round(float(short.mean()))) if len(short) else step
-    number = np.rint((times - times[0]) * rate).astype(int)
+    number = np.rint((times - times[0]) * rate).astype(int).tolist()
     frames, kept = [], []
-    for k, frame in enumerate(used):
+    ends = [*number[1:], None]
+    for frame, since, until in zip(record.frames, number, ends, strict=True):
         frames.append(frame)
-        kept.append(number[k] % step == 0 or k == 0)
-        last = k + 1 == len(used)
-        if last or times[k + 1] - times[k] > _MAX_FILLED_S:
+        kept.append(since % step == 0)
+        if until is None or until - since > _MAX_FILLED_S * rate:
             continue
-        for n in range(number[k] + 1, number[k + 1]):
-            if n % step:
-                continue
-            time, slot = times[0] + n / rate, frame.slot
-            later = lambda slot: record.slots.get((frame.map, slot + 1))
-            while (there := later(slot)) is not None and there.time <= time:
+        for n in range(since + step - since % step, until, step):
+            slot, time = frame.slot, times[0] + n / rate
+            while (at := record.slots.get((frame.map, slot + 1))) and at.time <= time:
                 slot += 1
             none = np.eye(4), False, {}, None, False, True
             frames.append(Seen(time, frame.map, slot, *none))
