@@ -4,8 +4,9 @@ Somebody cut off at the waist, or behind a table, has legs that follow from the 
 body alone, and looks nearly alike whether legs sit or stand: guessed legs of people on
 stools hang as those of people who stand. What differs is how far the pelvis moves,
 which gives a probability (`tools/sitting_probability.py`, with figures in
-`benchmarks/plausibility.md`). Neither the lean of the trunk is used, since up is taken
-from trunks where no foot stands, nor the height over a floor that no foot determines.
+`benchmarks/plausibility.md`), by which legs are posed (`pipeline.seated_legs`). Neither
+the lean of the trunk is used, since up is taken from trunks where no foot stands, nor
+the height over a floor that no foot determines.
 """
 
 import dataclasses
