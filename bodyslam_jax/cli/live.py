@@ -286,7 +286,7 @@ def _follow(
         latencies = [*latencies[-99:], estimate.latency]
         late = sorted(latencies)[int(0.95 * (len(latencies) - 1))]
         here = len(indices) - capture.skipped
-        rate = here / max(now - begun, 1e-9)
+        rate = here / max(time.monotonic() - begun, 1e-9)
         looks = online.counts.looks / max(online.counts.frames, 1) * rate
         figures = _figures(estimate, rate, looks, late, capture.dropped)
         done = {}
