@@ -178,7 +178,7 @@ def _about_length(input: Path, frames: int) -> str:
     return (
         f"{text}. `bodyslam live {shlex.quote(str(input))} --every-frame` needs "
         f"{of_live:.0f} GB, and goes on after an interruption; it estimates one "
-        "person, less exactly, and closes no loops (docs/live.md)"
+        "person, less exactly (docs/live.md)"
     )
 
 
