@@ -103,12 +103,17 @@ class Builder(Mapper):
             self.threshold *= 2
             self.pixel *= 2
             wider, wider_score = self._best_start(keyframes, starts[:2])
-            gain = 0.0 if wider is None else self._share_beyond(wider, 0.5)
-            if min(wider_score - score, gain) < _MIN_TOLERANCE_GAIN:
+            if wider is None or wider_score < score + _MIN_TOLERANCE_GAIN:
                 self.threshold /= 2
                 self.pixel /= 2
                 break
             best, score = wider, wider_score
+            if self._share_beyond(wider, 0.5) < _MIN_TOLERANCE_GAIN:
+                # It is a better start, but not by its tolerance.
+                self.threshold /= 2
+                self.pixel /= 2
+                self._mark(best)
+                break
         if best is None:
             return None
         self.joining = self.config.join_tracks

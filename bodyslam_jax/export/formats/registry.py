@@ -156,7 +156,8 @@ FORMATS: dict[str, Format] = {
         Format(
             "csv",
             ".csv",
-            "one person's joints with sigmas, joint angles, speeds",
+            "one person's joints with sigmas, the pelvis' place with sigmas, joint "
+            "angles, speeds",
             "y or z up; segments x forward, y up, z right (ISB)",
             "m, degrees, m/s, s",
             _OWN_TIMES,
