@@ -12,8 +12,10 @@ import pytest
 
 import bodyslam_jax as bs
 from bodyslam_jax import io, pipeline, simulation
+from bodyslam_jax.cli import live as cli_live
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.config.errors import InputError
+from bodyslam_jax.graph import validation
 from bodyslam_jax.io.capture import Capture
 from bodyslam_jax.online import checkpoint, online
 from bodyslam_jax.online.loops import Correction
@@ -213,6 +215,48 @@ def test_a_long_video_is_told_what_it_takes(
     found = [line for line in caplog.messages if "GB of memory" in line]
     assert len(found) == (frames == 3000)
     assert all(f"live {clip} --every-frame" in line for line in found)
+
+
+@pytest.mark.parametrize(
+    "gigabytes, given, in_windows",
+    [
+        (2, (), True),
+        (16, (), False),
+        (2, ("--windows", "never"), False),
+        (16, ("--windows", "always"), True),
+        (2, ("--end", "20"), False),
+        (2, ("--keypoints", "keypoints.npz"), False),
+    ],
+)
+def test_a_video_beyond_memory_is_estimated_in_windows(
+    clip, command, monkeypatch, tmp_path, gigabytes, given, in_windows
+):
+    done = []
+
+    def whole(*given):
+        done.append("whole")
+        raise InputError("not computed here")
+
+    def windows(source, *, out, page, every_frame, **shared):
+        assert source == str(clip) and out == tmp_path / "out"
+        assert every_frame and not page
+        done.append("windows")
+        return 0
+
+    long = Sequence("clip", None, np.arange(3000) / 30, CAMERA)
+    monkeypatch.setattr(io, "read_sequence", lambda *given, **known: long)
+    monkeypatch.setattr(pipeline, "run_to_folder", whole)
+    monkeypatch.setattr(cli_live, "live", windows)
+    monkeypatch.setattr(validation, "memory", lambda: gigabytes * 10**9)
+    command("run", clip, "--out", tmp_path / "out", *given)
+    assert done == ["windows" if in_windows else "whole"]
+
+
+def test_windows_are_for_a_video_alone(command, monkeypatch, tmp_path):
+    given = Sequence("folder", None, np.arange(10) / 30, CAMERA)
+    monkeypatch.setattr(io, "read_sequence", lambda *_, **known: given)
+    code, said = command("run", tmp_path, "--windows", "always")
+    assert code not in (0, 3) and "--windows always: found a folder" in said
 
 
 # All of it.

@@ -4,7 +4,7 @@ import logging
 import shlex
 import webbrowser
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -31,6 +31,7 @@ def run(
     camera: Path | None = None,
     tracks: Path | None = None,
     masks: Path | None = None,
+    windows: Literal["auto", "always", "never"] = "auto",
     preset: Preset = "default",
     settings: Path | None = None,
     open: bool = False,
@@ -52,6 +53,9 @@ def run(
         tracks: Point tracks (tracks.npz), if not in the input.
         masks: Person masks, non-zero is a person: folder of .png, or .npz with `masks`
             (frames, height, width), if not in the input.
+        windows: Whether a video alone is estimated in overlapping windows, in memory
+            that does not grow with its length, as by `live --every-frame`: one person,
+            less exactly. `auto`: if all frames at once need more memory than there is.
         preset: `paper` selects the paper's weights, motion network and solver.
         settings: Settings file (config.yaml); it overrides the preset, and options
             override both.
@@ -61,6 +65,7 @@ def run(
     from bodyslam_jax import io, pipeline
     from bodyslam_jax.cli.folders import default_folder
 
+    given = keypoints, bodies, tracks, masks
     sequence = io.read_sequence(
         input,
         keypoints=keypoints,
@@ -71,6 +76,12 @@ def run(
         config=config.association,
         known=config,
     )
+    alone = input.is_file() and all(file is None for file in given)
+    if _in_windows(windows, alone, sequence.num_frames, config):
+        from bodyslam_jax.cli.live import live
+
+        shared: dict[str, Any] = {"out": out, "camera": camera, "config": config}
+        return live(str(input), page=False, every_frame=True, **shared)
     out = out or default_folder(sequence)
     _announce(f"run: {input}, {sequence.num_frames} frames", out)
     if sequence.num_frames >= _LONG_FRAMES:
@@ -164,6 +175,34 @@ def evaluate(
         for line in evaluation.gaps(found.scope):
             log.warning(line)
     print(evaluation.to_json(found) if json else evaluation.to_table(found))
+
+
+def _in_windows(windows: str, alone: bool, frames: int, config: Config) -> bool:
+    """Returns whether a video is estimated in overlapping windows, and says why.
+
+    **Raises:** `InputError` if that is asked for and not possible.
+    """
+    from bodyslam_jax.cli.live import refused
+    from bodyslam_jax.config.errors import InputError
+    from bodyslam_jax.graph.validation import memory
+
+    if windows == "always":
+        if not alone:
+            raise InputError(
+                "--windows always: found a folder or further files, expected a video "
+                "file alone."
+            )
+        return True
+    need, have = _RUN_GB[0] + _RUN_GB[1] * frames / 1000, memory() / 1e9
+    if windows == "never" or not alone or need < have or refused(config):
+        return False
+    log.warning(
+        "%d frames take about %.0f GB of memory at once, found %.0f GB: they are "
+        "estimated in overlapping windows, one person, less exactly (docs/live.md); "
+        "`--windows never` does without",
+        *(frames, need, have),
+    )
+    return True
 
 
 def _about_length(input: Path, frames: int) -> str:

@@ -73,13 +73,18 @@ def live(
             --end, --height, --camera-path, --person) is refused.
     """
     from bodyslam_jax import export
+    from bodyslam_jax.config.errors import InputError
     from bodyslam_jax.io.camera.calibration import read_camera
     from bodyslam_jax.io.capture import Capture
     from bodyslam_jax.online import Online
     from bodyslam_jax.pipeline.progress import compiling
     from bodyslam_jax.pipeline.stage_cache import fingerprint
 
-    _check(config)
+    if options := refused(config):
+        raise InputError(
+            f"{options[0]}: is of a whole video, which `live` and `run --windows "
+            "always` do not use; use `bodyslam run`."
+        )
     # It has a line for each window.
     logging.getLogger("bodyslam_jax.people.fit").setLevel(logging.WARNING)
     capture = Capture(source, config.fps, every=every_frame)
@@ -226,17 +231,11 @@ def _write_folder(online: Any, result: Any, out: Path) -> None:
         export.write_report(partial / "report.html", result, online.body, still)
 
 
-def _check(config: Config) -> None:
-    """Refuses settings that describe a whole video, which does not exist yet.
-
-    **Raises:** `InputError` that names the option.
-    """
-    from bodyslam_jax.config.errors import InputError
-
-    for name in ("start", "end", "camera_path", "person", "height"):
-        if getattr(config, name) not in (None, False, ()):
-            option = "--" + name.replace("_", "-")
-            raise InputError(f"{option}: `live` does not use it; use `bodyslam run`.")
+def refused(config: Config) -> list[str]:
+    """Returns the options that describe a whole video, which does not exist yet."""
+    names = ("start", "end", "camera_path", "person", "height")
+    found = [n for n in names if getattr(config, n) not in (None, False, ())]
+    return ["--" + name.replace("_", "-") for name in found]
 
 
 def _page(wanted: bool, port: int, open: bool) -> Any:
