@@ -456,7 +456,7 @@ def test_added_frames_have_no_weight_in_any_factor():
             found, expected = padded.cost(longer), factor.cost(state)
             np.testing.assert_allclose(found, expected, rtol=1e-12, err_msg=name)
             checked += 1
-    assert checked >= 10
+    assert checked >= 9
 
 
 @pytest.mark.slow
