@@ -14,12 +14,15 @@ from bodyslam_jax import evaluation, graph, simulation
 from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.graph import CHUNK
-from bodyslam_jax.online import maps
+from bodyslam_jax.online import maps, window_problem
 from bodyslam_jax.online import prior as priors
 from bodyslam_jax.online.online import SMOOTHED
 from bodyslam_jax.online.record import smoothed_scales
 from bodyslam_jax.online.window import SCALE_WALK, Window
 from bodyslam_jax.online.window_content import FRAMES, Measured
+from bodyslam_jax.online.window_problem import (
+    GROUND_HALF_INFORMATION_FRAMES as HALF_INFORMATION,
+)
 from bodyslam_jax.types import Result, Sequence
 
 # The prior of a window.
@@ -126,6 +129,24 @@ def test_scales_of_all_windows_are_those_of_a_dense_smoother():
         matrix[k : k + 2, k : k + 2] += np.array([[1, -1], [-1, 1]]) / walk
     assert np.abs(found - np.linalg.solve(matrix, right)).max() < 1e-4
     assert sigma == pytest.approx(told[-1][2])
+
+
+def test_what_was_told_of_s_is_forgotten_as_it_walks():
+    """As much is left of the information of steps and ground on s as of that of all."""
+    window = Window(CAMERA, bs.load_body_model(), Config(), 10.0, 1)
+    squared = Config().weights.fitted_step_error ** 2
+    of_steps = lambda: window.steps_told / (1 + squared * window.steps_told)
+    of_ground = lambda: window.ground_told / (HALF_INFORMATION + window.ground_told)
+    window.steps_told[:], window.ground_told = 300.0, 30.0
+    before = of_steps(), of_ground()
+    window_problem.forget(window, 0.01)  # no s yet
+    assert (of_steps(), of_ground()) == before
+    window.scale, window.scale_sigma = 4.0, 0.4
+    window_problem.forget(window, 0.01)
+    np.testing.assert_allclose(of_steps(), before[0] / 2, rtol=1e-12)
+    np.testing.assert_allclose(of_ground(), before[1] / 2, rtol=1e-12)
+    window_problem.forget(window, 0.0)
+    np.testing.assert_allclose(of_steps(), before[0] / 2, rtol=1e-12)
 
 
 def test_what_update_and_finish_refuse():

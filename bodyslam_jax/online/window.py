@@ -128,17 +128,19 @@ class Window(Content):
         self.prior = None
         self._follow()
         people, fixed = list(self.people), self.fixed
-        told = self.steps_told, self.ground_told, self.pixel_sigma
         at = self.first + self.count + frames
         scale, variance = self.scale, self.scale_sigma**2
+        walked = SCALE_WALK**2 * frames / self.fps
+        window_problem.forget(self, walked)
+        told = self.steps_told, self.ground_told, self.pixel_sigma
         self.restart()
         self.people, self.fixed = people, fixed
         self.steps_told, self.ground_told, self.pixel_sigma = told
         self.shapes = np.array([self._known_shape(p) for p in self.people])
         self.began[:] = -1
         self.first = self.start = self.solved_until = at
-        walked = (scale * SCALE_WALK) ** 2 * frames / self.fps
-        self.scale, self.scale_sigma = scale, (variance + walked) ** 0.5
+        self.scale = scale
+        self.scale_sigma = (variance + scale**2 * walked) ** 0.5
 
     def _solve(self, clock: "_Clock") -> Solved:
         """Solves the window with its current frames."""
@@ -261,6 +263,7 @@ class Window(Content):
             self.told = self.told[:, CHUNK:]
         sigma = np.asarray(_ground_of(problem).sigma)[:, CHUNK : 2 * CHUNK]
         self.ground_told += float(np.isfinite(sigma).sum())
+        window_problem.forget(self, SCALE_WALK**2 * CHUNK / self.fps)
         self._shift()
         # What is left is marginalised next where chunks come faster than solves.
         factors = (*left.problem.factors[:-1], self.prior)

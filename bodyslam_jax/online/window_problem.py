@@ -46,7 +46,7 @@ _MAX_MEDIAN_ERROR = 6.0
 deviation."""
 _MIN_STEPS = 8
 """Least number of predicted steps from which s is estimated: about a second."""
-_GROUND_HALF_INFORMATION_FRAMES = 10.0
+GROUND_HALF_INFORMATION_FRAMES = 10.0
 """Number of frames with ground whose information is half that of infinitely many."""
 _DEFINITION = "unknown"
 """The detector's definition of hip and knee (`Keypoints.definition`)."""
@@ -306,6 +306,25 @@ def _steps_once(
     return moved, told
 
 
+def forget(window: Content, variance: float) -> None:
+    """Lowers what steps and ground told before, as s has walked since by this relative
+    variance: of the information on s as much is left as of that of its estimate, and
+    the same steps tell the new s what they told the old one.
+
+    Without that s would become unknown after minutes, whoever walks.
+    """
+    known = (window.scale_sigma / window.scale) ** 2
+    if window.fixed or not np.isfinite(known):
+        return
+    kept = known / (known + variance)
+    squared = window.config.weights.fitted_step_error**2
+    steps = kept * window.steps_told / (1 + squared * window.steps_told)
+    window.steps_told = steps / (1 - squared * steps)
+    ground = kept * window.ground_told
+    ground /= GROUND_HALF_INFORMATION_FRAMES + window.ground_told
+    window.ground_told = GROUND_HALF_INFORMATION_FRAMES * ground / (1 - ground)
+
+
 def _ground(
     window: Content,
     sequence: Sequence,
@@ -344,7 +363,7 @@ def _ground(
     sigma = np.asarray(contact.sigma)
     used = np.isfinite(sigma)
     count, told = float(used.sum()), window.ground_told
-    share = lambda n: n / (_GROUND_HALF_INFORMATION_FRAMES + n)
+    share = lambda n: n / (GROUND_HALF_INFORMATION_FRAMES + n)
     grown = max(share(told + count) - share(told), 1e-9)
     # `sigma` is that of all frames together times the root of their number.
     sigma = sigma / np.sqrt(count) * np.sqrt(count / grown)
