@@ -307,11 +307,14 @@ def _steps_once(
 
 
 def forget(window: Content, variance: float) -> None:
-    """Lowers what steps and ground told before, as s has walked since by this relative
-    variance: of the information on s as much is left as of that of its estimate, and
-    the same steps tell the new s what they told the old one.
+    """Discounts the information on s that steps and the ground gave before a random
+    walk of s with this variance, relative to s².
 
-    Without that s would become unknown after minutes, whoever walks.
+    Their errors are common to all frames, so the information that they gave is
+    subtracted from what they give next (`_steps_once`, `_ground`). The walk, of variance
+    q, leaves the share P / (P + q) of the information on s, where P is its relative
+    variance; the same share of what each source gave is left, so that later steps
+    measure the new s. Otherwise the variance of s would grow without bound.
     """
     known = (window.scale_sigma / window.scale) ** 2
     if window.fixed or not np.isfinite(known):
