@@ -311,10 +311,10 @@ def forget(window: Content, variance: float) -> None:
     walk of s with this variance, relative to s².
 
     Their errors are common to all frames, so the information that they gave is
-    subtracted from what they give next (`_steps_once`, `_ground`). The walk, of variance
-    q, leaves the share P / (P + q) of the information on s, where P is its relative
-    variance; the same share of what each source gave is left, so that later steps
-    measure the new s. Otherwise the variance of s would grow without bound.
+    subtracted from what they give next (`_steps_once`, `_ground`). The walk, of
+    variance q, leaves the share P / (P + q) of the information on s, where P is its
+    relative variance; the same share of what each source gave is left, so that later
+    steps measure the new s. Otherwise the variance of s would grow without bound.
     """
     known = (window.scale_sigma / window.scale) ** 2
     if window.fixed or not np.isfinite(known):
