@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bodyslam_jax import simulation
+from bodyslam_jax.body.skeleton import HIPS
 from bodyslam_jax.config import Simulation
 from bodyslam_jax.diagnostics import figures, moments, standing_height
 from bodyslam_jax.diagnostics.checks import (
@@ -136,6 +137,31 @@ def test_up_is_compared_with_the_top_of_the_image(truth):
         turned[:, :3, :3] = turned[:, :3, :3] @ turn
         of_person = {"up_in_image": figures.up_in_image(turned)}
         assert [r.name for r in judge(WORLD_CHECKS, of_person)] == ["up_in_image"]
+
+
+def test_walkers_who_lean_further_than_their_feet_reach_are_doubted(walk):
+    def names(joints, walking):
+        lean = figures.lean_of_walkers(joints, walking)
+        return [r.name for r in judge(WORLD_CHECKS, {"lean_of_walkers": lean})]
+
+    def leaning(degrees):
+        turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+        return walk @ turn.T
+
+    everywhere = np.ones((2, len(walk)), bool)
+    both = np.stack([walk, walk])
+    assert figures.lean_of_walkers(both, everywhere) < 3
+    assert names(both, everywhere) == []
+    assert names(np.stack([leaning(12), leaning(12)]), everywhere) == [
+        "lean_of_walkers"
+    ]
+    # One to each side: neither is up wrong nor do all bodies lean.
+    assert names(np.stack([leaning(9), leaning(-9)]), everywhere) == []
+    # Who crouches may have a seat; nobody who walks, nobody to judge.
+    low = walk.copy()
+    low[:, HIPS] -= [0.0, 0.4, 0.0]
+    assert np.isnan(figures.lean_of_walkers(low[None], everywhere[:1]))
+    assert np.isnan(figures.lean_of_walkers(both, ~everywhere))
 
 
 def test_people_who_float_or_sink_are_doubted(walk):

@@ -43,7 +43,11 @@ def pieces(path: Path, seconds: float) -> Iterator[tuple[str, dict[str, float]]]
             part = joints[start : start + size]
             if len(part) >= SHORTEST * clip.fps:
                 here = np.ones(len(part), bool)
-                yield clip.name, figures.person_figures(part, here, clip.fps)
+                found = figures.person_figures(part, here, clip.fps)
+                if "trunk_lean" in found:
+                    every = part[None], here[None]
+                    found["lean_of_walkers"] = figures.lean_of_walkers(*every)
+                yield clip.name, found
 
 
 def place(clip: motion.Clip) -> np.ndarray:

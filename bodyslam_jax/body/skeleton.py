@@ -50,9 +50,12 @@ MIRRORED: tuple[int, ...] = (
 )
 """For each joint, the one on the other side of the body."""
 PELVIS, NECK, HEAD = (JOINT_NAMES.index(name) for name in ("pelvis", "neck", "head"))
-HIPS, KNEES, ANKLES, FEET, WRISTS, HANDS = (
+HIPS, KNEES, ANKLES, FEET, SHOULDERS, ELBOWS, WRISTS, HANDS = (
     (JOINT_NAMES.index(f"left_{name}"), JOINT_NAMES.index(f"right_{name}"))
-    for name in ("hip", "knee", "ankle", "foot", "wrist", "hand")
+    for name in (
+        *("hip", "knee", "ankle", "foot"),
+        *("shoulder", "elbow", "wrist", "hand"),
+    )
 )
 """Joints by name, left and right; SMPL's foot joint is at the base of the toes."""
 ANKLES_AND_FEET = (ANKLES[0], FEET[0], ANKLES[1], FEET[1])

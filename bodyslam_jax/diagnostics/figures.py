@@ -35,6 +35,9 @@ _MIN_RUNNING_CADENCE_HZ = 2.4
 """Cadence from which steps may be those of a run, steps per second."""
 _MIN_ADVANCING_SPEED_M_S = 0.8
 """Mean speed from which either foot must stand in turn."""
+_MIN_UPRIGHT_LEGS = 0.8
+"""Height of the hips over the ankle, leg lengths, below which people crouch or sit, and
+a seat may support them; those of walkers are 0.85 at least (`thresholds`)."""
 _LEG_FIGURES = (
     *("standing_foot_speed", "gliding", "quick_steps", "step_short_of_reach"),
     *("step_beyond_reach", "step_beyond_reach_of_runner", "feet_off_ground"),
@@ -154,6 +157,28 @@ def floors_apart(
     stances = find_stances(joints[:, :, list(FEET)], present, fps)
     heights = [np.median(places[:, 1]) for places in stances if len(places)]
     return float(np.ptp(heights)) if len(heights) > 1 else np.nan
+
+
+def lean_of_walkers(
+    joints: Float[np.ndarray, "h t 24 3"], walking: Bool[np.ndarray, "h t"]
+) -> float:
+    """Returns the angle between the vertical and the mean line from supporting feet to
+    the centre of mass of all people who walk, degrees; NaN if nobody does for half a
+    second.
+
+    Over whole steps of somebody whose velocity is the same before and after, the weight
+    acts where the feet push, so that this line is vertical to within a foot.
+
+    Args:
+        joints: m, world frame, y up.
+        walking: frames in which a person walks and the legs are observed.
+    """
+    chosen = joints[walking]
+    chosen = chosen[posture.hip_over_ankle(chosen) > _MIN_UPRIGHT_LEGS]
+    if len(chosen) < _MIN_STRETCH_FRAMES:
+        return np.nan
+    line = posture.line_of_support(chosen).mean(axis=0)
+    return float(np.degrees(np.arctan2(np.hypot(line[0], line[2]), line[1])))
 
 
 def worst_misfit(

@@ -61,7 +61,7 @@ def implausible(
             are not judged there.
     """
     fps, of_people = sequence.fps, []
-    walking = False
+    walkers = np.zeros(result.present.shape, bool)
     misfits = _misfits(sequence, body, joint)
     present = result.present & measurable[:, None]
     judged = lambda checks, found, who, where: tuple(
@@ -75,7 +75,8 @@ def implausible(
         if not stepping[there].all():
             of_legs = figures.person_figures(result.joints[h], stepping, fps, ground)
             of_person = figures.with_legs_of(of_person, of_legs)
-        walking |= "trunk_lean" in of_person
+        if "trunk_lean" in of_person:
+            walkers[h] = stepping
         if there.any():
             stature = statures[h]
             if stature is not None:
@@ -98,7 +99,8 @@ def implausible(
     of_world = {
         "floors_apart": figures.floors_apart(result.joints, present & ~inferred, fps)
     }
-    if walking:
+    if walkers.any():
+        of_world["lean_of_walkers"] = figures.lean_of_walkers(result.joints, walkers)
         of_world["up_against_trunks"] = np.degrees(up.trunks)
         of_world["slope_of_ground"] = np.degrees(up.ground)
     elif result.present.any():

@@ -7,11 +7,40 @@ frame whose y axis is up. "Horizontal" is the plane of x and z.
 import numpy as np
 from jaxtyping import Float
 
-from bodyslam_jax.body.skeleton import ANKLES, FEET, HIPS, KNEES, NECK, PELVIS
+from bodyslam_jax.body.skeleton import (
+    ANKLES,
+    ELBOWS,
+    FEET,
+    HEAD,
+    HIPS,
+    KNEES,
+    NECK,
+    PELVIS,
+    SHOULDERS,
+    WRISTS,
+)
 
 _HORIZONTAL_AXES = (0, 2)
 RUNNING_SPEED_M_S = 2.2
 """Speed above which neither foot need be on the ground for half of the time."""
+_SEGMENTS = (
+    (0.081, NECK, HEAD, 1.0),
+    (0.497, PELVIS, NECK, 0.5),
+    *((0.100, hip, knee, 0.433) for hip, knee in zip(HIPS, KNEES)),
+    *((0.0465, knee, ankle, 0.433) for knee, ankle in zip(KNEES, ANKLES)),
+    *((0.0145, ankle, toe, 0.5) for ankle, toe in zip(ANKLES, FEET)),
+    *((0.028, shoulder, elbow, 0.436) for shoulder, elbow in zip(SHOULDERS, ELBOWS)),
+    *((0.022, elbow, wrist, 0.682) for elbow, wrist in zip(ELBOWS, WRISTS)),
+)
+"""Segments of the body: share of its mass, joints at its ends, and the position of its
+centre of mass between them. Winter, *Biomechanics and Motor Control of Human Movement*,
+2009, table 4.1; forearm and hand are one, and the joints are SMPL's."""
+_ANKLE_OVER_TOE_M = 0.05
+"""Height of an ankle over the toe joint of a foot that is flat on the ground, m, in the
+default body."""
+_SUPPORT_TOLERANCE_M = 0.03
+"""Height above the lowest point of the feet up to which others support, too, m:
+standing feet of walkers differ by 0.01 to 0.02 (`benchmarks/plausibility.md`)."""
 
 
 def knee_flexion(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, "t 2"]:
@@ -34,6 +63,21 @@ def trunk_lean(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, " t"]:
     degrees."""
     trunk = joints[:, NECK] - joints[:, PELVIS]
     return _angle(trunk, np.broadcast_to([0.0, 1.0, 0.0], trunk.shape))
+
+
+def line_of_support(joints: Float[np.ndarray, "t 24 3"]) -> Float[np.ndarray, "t 3"]:
+    """Returns the vector from the middle of the points that support the body to its
+    centre of mass, m: ankles and toes that are as low as the lowest of them, so that a
+    foot whose heel has left the ground supports at its toes."""
+    mass = sum(
+        share * (joints[:, a] + at * (joints[:, b] - joints[:, a]))
+        for share, a, b, at in _SEGMENTS
+    )
+    points = joints[:, ANKLES + FEET]
+    sole = points[..., 1] - np.repeat([_ANKLE_OVER_TOE_M, 0.0], 2)
+    supports = sole < sole.min(axis=1, keepdims=True) + _SUPPORT_TOLERANCE_M
+    middle = (points * supports[..., None]).sum(axis=1)
+    return mass - middle / supports.sum(axis=1)[:, None]
 
 
 def lower_foot_speed(

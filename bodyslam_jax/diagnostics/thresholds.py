@@ -310,6 +310,19 @@ WORLD_CHECKS: tuple[Check, ...] = (
         source="ten simulated sequences: 0.7 to 5",
     ),
     Check(
+        "lean_of_walkers",
+        "angle between up and the mean line from supporting feet to the centre of mass "
+        "of people who walk",
+        "degrees",
+        8.0,
+        "people who lean so fall: up is wrong, or bodies lean along the view, which "
+        "images hardly show; give the focal length (--focal), up (--gravity), or "
+        "bodies (--bodies)",
+        source="equilibrium: the centre of mass is at 0.55 of the stature and at most "
+        "half of a foot, 0.152 of it long (Drillis and Contini, 1966), from the middle "
+        "of the foot, 7.9; " + _MOCAP + " of people who walk: at most 6.5",
+    ),
+    Check(
         "up_in_image",
         "angle between up, as trunks of people who do not walk tell it, and the top of "
         "the image",

@@ -86,6 +86,7 @@ _PERSON_SENTENCES = {
 _WHOLE_SENTENCES = {
     "floors_apart": "People stand at different heights, as if on different floors.",
     "up_against_trunks": "The ground is tilted against the people on it.",
+    "lean_of_walkers": "People lean as nobody can who walks.",
     "up_in_image": "The scene is tilted against the images.",
     "slope_of_ground": "The ground slopes against the people on it.",
     "camera_speed": "The camera moves faster than somebody can carry it.",
