@@ -69,15 +69,9 @@ def test_is_finite_at_and_behind_the_camera(intrinsics, dtype):
     for depth in (-2.0, 0.0, 1e-9, 1e-3):
         for x in (0.0, 10.0):
             p_C = jnp.array([x, 0.5 * x, depth], dtype)
-            assert not camera.depth_is_valid(p_C)
             value, gradients = with_gradient(intrinsics, p_C)
             assert jnp.isfinite(value)
             assert all(jnp.isfinite(g).all() for g in gradients)
-
-
-def test_depth_validity():
-    p_C = jnp.array([[0.0, 0.0, 2.0], [0.0, 0.0, -2.0]])
-    assert camera.depth_is_valid(p_C).tolist() == [True, False]
 
 
 def test_does_not_fold_the_outside_into_the_image():

@@ -1,7 +1,6 @@
 """Runs a job, one clip with its settings, into a folder; it depends on nothing else."""
 
 import dataclasses
-import functools
 import logging
 import socket
 import time
@@ -57,8 +56,6 @@ class Outcome:
     """Reason why the job failed or its result is doubtful."""
     seconds: float = 0.0
     """Duration, s; 0 for a job that was finished before."""
-    compilations: int = 0
-    """Number of programs that were compiled for it, not taken from the cache."""
     machine: str = ""
     was_finished: bool = False
     """Whether an earlier run had finished it."""
@@ -102,7 +99,7 @@ def run_job(job: Job, *, estimate: Estimate | None = None) -> Outcome:
     job, `logs/NAME.txt` in the folder of the batch. If another process is running the
     job, the function waits for it.
     """
-    start, before = time.monotonic(), _compilations().count
+    start = time.monotonic()
     try:
         home = job.batch
         if not job.out.parent.is_dir():
@@ -121,7 +118,6 @@ def run_job(job: Job, *, estimate: Estimate | None = None) -> Outcome:
     return dataclasses.replace(
         outcome,
         seconds=0.0 if outcome.was_finished else round(time.monotonic() - start, 2),
-        compilations=_compilations().count - before,
         machine=socket.gethostname(),
     )
 
@@ -190,13 +186,6 @@ def _recorded(job: Job, found: dict[str, Any]) -> Outcome:
 
 def _reasons(summary: dict[str, Any]) -> str:
     return " ".join(str(one.get("message")) for one in summary.get("reasons") or [])
-
-
-@functools.cache
-def _compilations() -> Any:
-    from bodyslam_jax.batch.program_cache import Compilations
-
-    return Compilations()
 
 
 class _logged:

@@ -152,7 +152,7 @@ class Known:
             found = _measured("focal", self.focal, None, "PIXELS or PIXELS±SIGMA")
             if not 0 < found.value < math.inf:
                 raise InputError(f"focal: found {found.value:g}, expected more than 0.")
-            return _or_share(found, FOCAL_SIGMA)
+            return _or_usual(found)
         if self.fov is None:
             return None
         angle = _measured("fov", self.fov, None, "DEGREES or DEGREES±SIGMA")
@@ -165,12 +165,12 @@ class Known:
         focal = width / 2 / math.tan(half)
         # d log f = -dθ / sin θ of the whole angle θ.
         sigma = focal * math.radians(angle.sigma) / math.sin(2 * half)
-        return _or_share(Measured(focal, sigma), FOCAL_SIGMA)
+        return _or_usual(Measured(focal, sigma))
 
 
-def _or_share(found: Measured, share: float) -> Measured:
-    """Replaces a NaN sigma by `share` times the value."""
-    sigma = share * found.value if math.isnan(found.sigma) else found.sigma
+def _or_usual(found: Measured) -> Measured:
+    """Replaces a NaN sigma by the usual share of the value."""
+    sigma = FOCAL_SIGMA * found.value if math.isnan(found.sigma) else found.sigma
     return Measured(found.value, sigma)
 
 

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 
 from bodyslam_jax.body.skeleton import FEET
 from bodyslam_jax.diagnostics import posture
-from bodyslam_jax.diagnostics.gait import Gait, gait_of_joints
+from bodyslam_jax.diagnostics.gait import MIN_STEP_LEGS, Gait, gait_of_joints
 from bodyslam_jax.diagnostics.moments import MOMENT_S
 from bodyslam_jax.diagnostics.standing_height import standing_height_figures
 from bodyslam_jax.geometry import so3_numpy as so3
@@ -14,8 +14,6 @@ from bodyslam_jax.ground.stances import find_stances
 
 _WALKING_SPEEDS_M_S = (0.7, posture.RUNNING_SPEED_M_S)
 """Range of median horizontal speeds in walking."""
-_MIN_STEP_LEGS = 0.35
-"""Step length from which regular steps are a walk at any speed, leg lengths."""
 _MIN_STRETCH_FRAMES = 15
 """Length from which a stretch is judged, frames."""
 
@@ -203,5 +201,5 @@ def _goes_on_foot(steps: Gait | None, speed: Float[np.ndarray, " u"]) -> bool:
     if slow < np.median(speed) < fast:
         return True
     return (
-        steps is not None and steps.step > _MIN_STEP_LEGS and bool(speed.mean() < fast)
+        steps is not None and steps.step > MIN_STEP_LEGS and bool(speed.mean() < fast)
     )

@@ -40,8 +40,9 @@ _MIN_STRIDES = 1.5
 _MIN_PEAK_CORRELATION, _MIN_PERIOD_CORRELATION = 0.2, 0.6
 """Autocorrelation from which a lag is a candidate for the period, and from which the
 first candidate is accepted."""
-_MIN_STEP_LEGS = 0.35
-"""Step length from which the frame rate is judged, leg lengths."""
+MIN_STEP_LEGS = 0.35
+"""Step length from which the frame rate is judged, and regular steps are a walk at any
+speed, leg lengths."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Gait:
     @property
     def strides(self) -> bool:
         """Whether the steps are long enough to judge the frame rate by them."""
-        return self.step > _MIN_STEP_LEGS
+        return self.step > MIN_STEP_LEGS
 
     def has_low_cadence(self) -> bool:
         """Returns whether the cadence is below that of nearly all walks, at any

@@ -100,11 +100,11 @@ def speed_change(
 
 
 def pelvis_speed(
-    joints: Float[np.ndarray, "t 24 3"], fps: float, over: float = 0.5
+    joints: Float[np.ndarray, "t 24 3"], fps: float
 ) -> Float[np.ndarray, " u"]:
-    """Returns the horizontal speed of the pelvis, mean over `over` seconds, m/s."""
+    """Returns the horizontal speed of the pelvis, mean over half a second, m/s."""
     place = joints[:, PELVIS][:, _HORIZONTAL_AXES]
-    n = max(1, min(round(over * fps), len(place) - 1))
+    n = max(1, min(round(fps / 2), len(place) - 1))
     return _length(place[n:] - place[:-n]) * fps / n
 
 

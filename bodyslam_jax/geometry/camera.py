@@ -5,14 +5,13 @@ end. C has x right, y down, z forward; pixel (0, 0) is the top-left pixel's cent
 Distortion: OpenCV's `calib3d` (Brown--Conrady), two radial and two tangential terms.
 
 Every function broadcasts over leading axes. Values and derivatives are finite, also at
-and behind the camera plane, where a projection is meaningless: `depth_is_valid` masks
-such points.
+and behind the camera plane, where a projection is meaningless.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from bodyslam_jax.geometry.lengths import padded_rows
 
@@ -24,11 +23,6 @@ _MAX_RADIUS_SQUARED = 16.0
 is held constant, unless it stops growing before."""
 
 
-def depth_is_valid(p_C: Float[Array, "*b 3"]) -> Bool[Array, "*b"]:
-    """True for points that lie in front of the camera by more than `MIN_DEPTH`."""
-    return p_C[..., 2] > MIN_DEPTH
-
-
 @jax.jit
 def project(
     intrinsics: Float[Array, "*#b i"], p_C: Float[Array, "*#b 3"]
@@ -36,7 +30,7 @@ def project(
     """Projects points in the camera frame to pixels (px).
 
     Depths below `MIN_DEPTH` are raised to it, so that points behind the camera have a
-    finite pixel and derivative; `depth_is_valid` tells which points are affected.
+    finite pixel and derivative.
     """
     depth = jnp.maximum(p_C[..., 2:], MIN_DEPTH)
     return _to_pixel(intrinsics, distort(intrinsics, p_C[..., :2] / depth))
@@ -93,7 +87,7 @@ def distort(
 
 
 def undistort(
-    intrinsics: Float[Array, "*#b i"], xy: Float[Array, "*#b 2"], iterations: int = 10
+    intrinsics: Float[Array, "*#b i"], xy: Float[Array, "*#b 2"]
 ) -> Float[Array, "*_ 2"]:
     """Inverts `distort` by Newton's method, which starts at the distorted point."""
     xy = xy + 0 * intrinsics[..., :2]
@@ -113,7 +107,7 @@ def undistort(
         return estimate - jnp.stack([step_x, step_y], axis=-1)
 
     # A scan, not an unrolled loop: ten inlined linearisations are slow to compile.
-    return jax.lax.scan(lambda p, _: (newton(p), None), xy, length=iterations)[0]
+    return jax.lax.scan(lambda p, _: (newton(p), None), xy, length=10)[0]
 
 
 def _to_pixel(intrinsics: Array, xy: Array) -> Array:

@@ -38,7 +38,7 @@ _MIN_HEIGHT_SIGMA_M = 0.02
 _RELATIVE_DEPTH_SIGMA = 0.02
 """Relative standard deviation of the distance between camera and stance: the part that
 is independent between stances."""
-_MAX_HEIGHT_SCATTER_M = 0.04
+MAX_HEIGHT_SCATTER_M = 0.04
 """Scatter of stances about the map's plane that estimation errors explain, m."""
 _MAX_STANCE_OFFSET = 0.25
 """Distance of the median stance from the map's plane, as a share of the camera's
@@ -212,7 +212,7 @@ def map_plane(
         away = every @ normal + offset
         if height <= 0 or abs(np.median(away)) > _MAX_STANCE_OFFSET * height:
             return None
-        excess = max(_scatter_of_level(away) ** 2 - _MAX_HEIGHT_SCATTER_M**2, 0.0)
+        excess = max(_scatter_of_level(away) ** 2 - MAX_HEIGHT_SCATTER_M**2, 0.0)
     away = landmarks @ normal + offset
     near = np.abs(away) < _MAX_PLANE_DISTANCE * height
     flat = landmarks[near][:, [0, 2]]

@@ -17,10 +17,9 @@ from jaxtyping import UInt8
 
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.video import open_video
+from bodyslam_jax.types import DEFAULT_FPS
 
 _STREAM = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
-_DEFAULT_FPS = 30.0
-"""Frame rate of cameras that do not report it, 1/s."""
 _MAX_FPS = 240.0
 """Largest plausible frame rate, 1/s."""
 
@@ -62,7 +61,7 @@ class Capture:
         self.every = every
         self.reader = self._open()
         told = float(self.reader.get(cv2.CAP_PROP_FPS) or 0.0)
-        usual = told if 0 < told <= _MAX_FPS else _DEFAULT_FPS
+        usual = told if 0 < told <= _MAX_FPS else DEFAULT_FPS
         self.fps = fps or usual
         ok, first = self.reader.read()
         if not ok or first is None:

@@ -11,7 +11,7 @@ from bodyslam_jax.io.frame_index import InvalidContent, Warn
 Size = tuple[float, float]
 """Width and height, px."""
 
-_ASPECT_TOLERANCE = 0.015
+ASPECT_TOLERANCE = 0.015
 """Largest relative difference of two aspect ratios that rounding to even sizes may
 cause."""
 _MAX_SIDE_PX = 1e6
@@ -98,8 +98,8 @@ def factor_to(
         return 1.0
     names = f"images of {w:g}x{h:g} px, but the video has {width}x{height} px"
     aspect = (w / h) / (width / height)
-    if abs(np.log(aspect)) > _ASPECT_TOLERANCE:
-        turned = abs(np.log((h / w) / (width / height))) < _ASPECT_TOLERANCE
+    if abs(np.log(aspect)) > ASPECT_TOLERANCE:
+        turned = abs(np.log((h / w) / (width / height))) < ASPECT_TOLERANCE
         why = "of the video before it was turned upright" if turned else "cropped"
         raise InvalidContent(f"{what} of {names}: {why}, or of another video?")
     factor = float(np.sqrt(width / w * height / h))

@@ -14,15 +14,15 @@ from jaxtyping import Bool, Float
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.io.archive import read_npz
 from bodyslam_jax.io.camera.calibration import project_points
+from bodyslam_jax.io.declared_size import ASPECT_TOLERANCE
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
 from bodyslam_jax.io.images import read_image
+from bodyslam_jax.io.keypoints.arrange import MIN_CONFIDENCE
 from bodyslam_jax.io.video import list_images
 from bodyslam_jax.types import Bodies, Intrinsics, Keypoints, MaskUse
 
 _NUM_CHECKED = 12
 """Number of masks that are checked when the input is read."""
-_MIN_CONFIDENCE = 0.3
-"""Least confidence of a keypoint that is compared with the masks."""
 _MIN_POINTS = 20
 """Least number of points of a person, in all checked frames, for a comparison."""
 _MAX_AREA_SHARE = 0.5
@@ -36,8 +36,6 @@ _MAX_MASKED_SHARE = 0.9
 _MARGIN = 0.02
 """Largest distance of a keypoint from a mask that counts as within, relative to the
 image's longer side."""
-_ASPECT_TOLERANCE = 0.015
-"""Largest difference of the logarithms of two equal aspect ratios."""
 _PELVIS_POINTS_M = np.array(
     [[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.5, -0.2, 0.3)]
 )
@@ -153,7 +151,7 @@ def resized_to(
     **Raises:** `InputError`, naming the file, if its aspect ratio is another.
     """
     height, width = mask.shape
-    if abs(np.log(width / height * size[1] / size[0])) > _ASPECT_TOLERANCE:
+    if abs(np.log(width / height * size[1] / size[0])) > ASPECT_TOLERANCE:
         raise InputError(
             f"{path}: {width}x{height} px, but the video is {size[0]}x{size[1]} px."
         )
@@ -209,7 +207,7 @@ def _points(
     """Returns image points of each person in each frame: u px, v px, 1 or 0 if
     missing."""
     if people is not None:
-        sure = people.confidence > _MIN_CONFIDENCE
+        sure = people.confidence > MIN_CONFIDENCE
         present = sure if sure.any() else people.confidence > 0
         return np.concatenate([people.uv, present[..., None].astype(float)], axis=-1)
     if bodies is None:

@@ -41,9 +41,7 @@ class _PlainMachine(Machine):
     instructions, calls, inert = STEPS, CALLS, INERT
 
 
-def restricted_load(
-    path: Path, stand_ins: tuple[str, ...] = (), *, objects: bool = True
-) -> Any:
+def restricted_load(path: Path, stand_ins: tuple[str, ...] = ()) -> Any:
     """Loads a pickle, joblib, `.pt`, `.npz` or `.npy` file made of plain data.
 
     Tensors become NumPy arrays, and arrays of objects nested lists. Arrays are new,
@@ -52,8 +50,6 @@ def restricted_load(
     Args:
         stand_ins: packages, such as `"scipy.sparse"`, whose objects become `StandIn`s
             instead of being refused. The packages are not imported.
-        objects: whether arrays of objects in an `.npz` are read; else they are left
-            out.
 
     **Raises:** `InputError`, one line that names the file, if it is damaged, holds
     anything else, or makes more than 1 GB.
@@ -67,7 +63,7 @@ def restricted_load(
             head = file.read(16)
             file.seek(0)
             if head.startswith(b"PK\x03\x04"):
-                return _load_zip(file, size, account, stand_ins, objects)
+                return _load_zip(file, size, account, stand_ins)
             if head.startswith(b"\x93NUMPY"):
                 return _load_array(file, size, account, stand_ins)
             return _load_pickle(file, head, account, stand_ins)
@@ -203,11 +199,7 @@ class _Guarded:
 
 
 def _load_zip(
-    file: Any,
-    size: int,
-    account: Account,
-    stand_ins: tuple[str, ...],
-    objects: bool,
+    file: Any, size: int, account: Account, stand_ins: tuple[str, ...]
 ) -> Any:
     """Loads a `.pt` of PyTorch 1.6 or later; or an `.npz`, as a dictionary."""
     with zipfile.ZipFile(_Guarded(file, size)) as archive:  # pyright: ignore
@@ -227,9 +219,6 @@ def _load_zip(
         for name, entry in members.items():
             if not name.endswith(".npy"):
                 continue
-            with archive.open(entry) as member:
-                if not objects and plain_arrays.read_header(member)[0].kind == "O":
-                    continue
             with archive.open(entry) as member:
                 array = _load_array(member, entry.file_size, account, stand_ins)
                 found[name.removesuffix(".npy")] = array

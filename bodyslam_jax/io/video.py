@@ -171,9 +171,9 @@ def _read_video(path: Path, gray: bool) -> Iterator[np.ndarray]:
         capture.release()
 
 
-def list_images(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
+def list_images(folder: Path) -> list[Path]:
     """Returns images of a folder in the order of the numbers in their names."""
-    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes]
+    found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
     return sorted((p for p in found if not p.name.startswith(".")), key=natural_key)
 
 
@@ -348,9 +348,9 @@ def _size(shape: tuple[int, ...]) -> str:
     return f"{shape[1]}x{shape[0]} px"
 
 
-def frame_name(frame: int, suffix: str = ".jpg") -> str:
+def frame_name(frame: int) -> str:
     """Returns the name of a frame's image, counted from 0."""
-    return f"frame_{frame:06d}{suffix}"
+    return f"frame_{frame:06d}.jpg"
 
 
 def extract_frames(

@@ -25,8 +25,6 @@ class Scale(NamedTuple):
     standard_error: float
     """Standard error of `value`, from the disagreement between parts of the sequence
     and the model's bias of a few per cent per sequence; inf with a single part."""
-    per_duration: dict[int, float]
-    """Estimates from displacements over each number of frames."""
 
 
 def scale_from_motion(
@@ -65,7 +63,7 @@ def scale_from_motion(
         moved = (walked[n:] - walked[:-n])[whole]
         ratio[n] = np.sqrt((moved * moved).sum() / (x * x).sum())
     if not found:
-        return Scale(float("nan"), float("inf"), {})
+        return Scale(float("nan"), float("inf"))
     chosen = [n for n in found if n >= 5] or list(found)
     value = float(np.median([found[n] for n in chosen]))
     # a short sequence has too few long windows for a standard error
@@ -73,7 +71,7 @@ def scale_from_motion(
     best = min(sure, key=lambda n: abs(found[n] - value))
     apart = np.std([found[n] for n in chosen])
     parts = (errors[best], apart, _MODEL_BIAS_SIGMA * ratio[best])
-    return Scale(value, float(np.linalg.norm(parts)), found)
+    return Scale(value, float(np.linalg.norm(parts)))
 
 
 def _robust_ratio(

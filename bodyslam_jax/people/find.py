@@ -162,7 +162,7 @@ class _Finder:
             else:
                 self._note(k, now, number, row)
         for number in range(first_new, len(self.tracker.tracklets)):
-            self._look_back(k, number)
+            self._look_back(number)
         if any(self._was_lost(t, k) for t in self.tracker.tracklets):
             sooner = max(k + 1, self.last_search + _MIN_SEARCH_GAP_FRAMES)
             self.next_search = min(self.next_search, sooner)
@@ -290,7 +290,7 @@ class _Finder:
         size = frame.image.shape[0], frame.image.shape[1]
         frame.mask |= blazepose.mask_in_image(pose, size, SILHOUETTE_STEP) > 0
 
-    def _look_back(self, k: int, number: int) -> None:
+    def _look_back(self, number: int) -> None:
         """Extends a new track backwards to the frames since the last search."""
         tracklet = self.tracker.tracklets[number]
         for index, frame in reversed(self.recent):

@@ -24,6 +24,7 @@ from bodyslam_jax.config import Config
 from bodyslam_jax.config.errors import InputError
 from bodyslam_jax.geometry.arrays import SIGMA_OF_MEDIAN
 from bodyslam_jax.ground.heights import wander
+from bodyslam_jax.ground.plane import MAX_HEIGHT_SCATTER_M
 from bodyslam_jax.pipeline.joint_problem import Prepared, solve_stage
 from bodyslam_jax.pipeline.motion_prediction import (
     contact_predictor,
@@ -34,9 +35,6 @@ from bodyslam_jax.types import Sequence, SfmResult
 _HEIGHT_SIGMA_M = 0.08
 """Standard deviation of the height of the lower foot over the ground in a frame of
 1/30 s, m: it is 2 cm for a stance, during which the error is constant."""
-_MAX_HEIGHT_SCATTER_M = 0.04
-"""Scatter of these heights above which the ground is weighted down, m: more than that
-of estimates on level ground."""
 _MIN_STANDING_FRAMES = 10
 """Least number of frames with standing feet for the ground to be shifted to their
 height."""
@@ -141,9 +139,9 @@ def stand_on_plane(
     offset = level + wander(height, used, fps)[0]
     away = np.abs(height - offset)
     spread = max(
-        SIGMA_OF_MEDIAN * float(np.median(away[used])) / _MAX_HEIGHT_SCATTER_M, 1.0
+        SIGMA_OF_MEDIAN * float(np.median(away[used])) / MAX_HEIGHT_SCATTER_M, 1.0
     )
-    near = used & (away < 3 * spread * _MAX_HEIGHT_SCATTER_M)
+    near = used & (away < 3 * spread * MAX_HEIGHT_SCATTER_M)
     # Of a frame of 1/30 s, constant over a stance: variances grow with the rate.
     sigma = _HEIGHT_SIGMA_M * spread * np.sqrt(fps / motion.FPS)
     sigma = np.where(near, sigma / np.sqrt(np.maximum(stands, 0.5)), np.inf)

@@ -15,13 +15,15 @@ from bodyslam_jax.sfm.multiview import essential_matrix
 _MAX_RATIO = 0.8
 """Largest ratio of the distances to the nearest and to the second descriptor (Lowe,
 IJCV 2004)."""
+BRISK_THRESHOLD, _BRISK_OCTAVES = 20, 3
+"""Initial threshold of BRISK, grey levels, and number of octaves of its pyramid."""
 _MISSING_BRISK_TEXT = (
     f"OpenCV {cv2.__version__} has no BRISK: install opencv-python-headless<5 or "
     "opencv-contrib-python-headless."
 )
 
 
-def make_brisk(threshold: int, octaves: int) -> Any:
+def make_brisk() -> Any:
     """Returns OpenCV's BRISK, from the main module or the contributed ones.
 
     **Raises:** `InputError` that says how to install it, if OpenCV has none.
@@ -29,7 +31,7 @@ def make_brisk(threshold: int, octaves: int) -> Any:
     home = _home_of_brisk()
     if home is None:
         raise InputError(_MISSING_BRISK_TEXT)
-    return home.BRISK_create(threshold, octaves)
+    return home.BRISK_create(BRISK_THRESHOLD, _BRISK_OCTAVES)
 
 
 def brisk_status() -> str:

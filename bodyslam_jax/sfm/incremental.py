@@ -37,7 +37,7 @@ _MIN_PLANAR_SHARE = 0.9
 a plane with the outliers that tracks have."""
 
 
-def first_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
+def first_pairs(pairs: np.ndarray) -> np.ndarray:
     """Returns pairs of keyframes to start from: much parallax, many points, spread in
     time.
 
@@ -54,7 +54,7 @@ def first_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
         span = pairs[i, 1] - pairs[i, 0]
         if not apart or min(apart) > 0.3 * span:
             chosen.append(pairs[i, :2])
-        if len(chosen) == count:
+        if len(chosen) == _NUM_FIRST_PAIRS:
             break
     return np.asarray(chosen).astype(np.int64)
 
@@ -95,7 +95,7 @@ class Builder(Mapper):
         kept if many inliers need it: a map with a needless tolerance joins few of the
         tracks that it could, and wrong ones, and its scale drifts.
         """
-        starts = first_pairs(pairs, _NUM_FIRST_PAIRS)
+        starts = first_pairs(pairs)
         best, score = self._best_start(keyframes, starts)
         for _ in range(2):
             if score > _MIN_EXPLAINED_SHARE:
@@ -108,7 +108,7 @@ class Builder(Mapper):
                 self.pixel /= 2
                 break
             best, score = wider, wider_score
-            if self._share_beyond(wider, 0.5) < _MIN_TOLERANCE_GAIN:
+            if self._share_beyond(wider) < _MIN_TOLERANCE_GAIN:
                 # It is a better start, but not by its tolerance.
                 self.threshold /= 2
                 self.pixel /= 2
@@ -277,11 +277,11 @@ class Builder(Mapper):
         """Returns the share of inliers among the observations in `frames`."""
         return self.share_explained(grown, frames)[0]
 
-    def _share_beyond(self, grown: PartialMap, tolerance: float) -> float:
-        """Returns the share of the inliers whose error is beyond `tolerance`, in
-        thresholds."""
+    def _share_beyond(self, grown: PartialMap) -> float:
+        """Returns the share of the inliers whose error is beyond half of the
+        threshold."""
         inliers = self.views[np.flatnonzero(grown.inlier)]
-        beyond = errors(grown.scene, inliers) > tolerance * self.threshold
+        beyond = errors(grown.scene, inliers) > self.threshold / 2
         return float(beyond.mean()) if len(beyond) else 0.0
 
     def share_explained(

@@ -27,7 +27,7 @@ from bodyslam_jax.types import Intrinsics
 
 _MAX_ERROR_PX = 3.0
 """Reprojection error of an inlier, px at 640x480."""
-_MIN_INLIERS = 12
+MIN_INLIERS = 12
 """Least number of inliers with which a camera is located."""
 _MIN_INLIER_SHARE = 0.3
 """Least share of inliers among the known points."""
@@ -164,7 +164,7 @@ class LiveMap:
         if too few fit."""
         found = resect(points, self._normalised(uv), self.threshold)
         if found is None or found[2].sum() < max(
-            _MIN_INLIERS, _MIN_INLIER_SHARE * len(points)
+            MIN_INLIERS, _MIN_INLIER_SHARE * len(points)
         ):
             return None
         self.T_WC, self.step = _pose(found[0], found[1]), np.eye(4)
@@ -241,13 +241,13 @@ class LiveMap:
         guess: Float[np.ndarray, "4 4"] | None,
     ) -> Float[np.ndarray, "4 4"] | None:
         known = np.array([i in self.points for i in ids.tolist()], bool)
-        if known.sum() < _MIN_INLIERS:
+        if known.sum() < MIN_INLIERS:
             return None
         points = np.array([self.points[i] for i in ids[known].tolist()])
         start = None if guess is None else (guess[:3, :3].T, guess[:3, 3])
         found = resect(points, xy[known], self.threshold, start)
         if found is None or found[2].sum() < max(
-            _MIN_INLIERS, _MIN_INLIER_SHARE * known.sum()
+            MIN_INLIERS, _MIN_INLIER_SHARE * known.sum()
         ):
             return None
         for i in ids[known][~found[2]].tolist():

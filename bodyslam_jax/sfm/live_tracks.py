@@ -17,13 +17,9 @@ from scipy.spatial import KDTree
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.features import epipolar_inliers, match, spread
 from bodyslam_jax.sfm.places import MIN_MATCHES, Place
+from bodyslam_jax.sfm.tracks import KLT_WINDOW_PX, MAX_ROUND_TRIP_PX, NUM_CELLS
 from bodyslam_jax.types import Intrinsics
 
-_MAX_ROUND_TRIP_PX = 0.5
-"""Largest forward-backward error, px, as offline (`tracks`)."""
-_WINDOW_PX = 21
-_NUM_CELLS = 8
-"""Number of cells along the longer side of the image, over which points are spread."""
 _MIN_TRACKED_SHARE = 0.85
 """Share of the wanted number of points below which new ones are detected."""
 _BORDER_PX = 4
@@ -149,7 +145,7 @@ class PointFollower:
         assert self.previous is not None
         uv, ok = _flow(self.previous, gray, self.uv, self.uv + self.step)
         back, ok_back = _flow(gray, self.previous, uv, self.uv)
-        ok &= ok_back & (np.linalg.norm(back - self.uv, axis=1) < _MAX_ROUND_TRIP_PX)
+        ok &= ok_back & (np.linalg.norm(back - self.uv, axis=1) < MAX_ROUND_TRIP_PX)
         ok &= self._inside(uv, mask)
         self.step, self.uv = uv - self.uv, uv
         self._keep(ok)
@@ -187,7 +183,7 @@ class PointFollower:
         uv = uv[self._inside(uv, mask)]
         if not len(uv):
             return
-        cell = -(-max(self.size) // _NUM_CELLS)
+        cell = -(-max(self.size) // NUM_CELLS)
         occupied = np.unique((uv // cell).astype(int), axis=0)
         quota = -(-self.wanted // max(len(occupied), 1))
         chosen = spread(
@@ -215,7 +211,7 @@ def _flow(
         b,
         uv.astype(np.float32).reshape(-1, 1, 2),
         guess.astype(np.float32).reshape(-1, 1, 2),
-        winSize=(_WINDOW_PX, _WINDOW_PX),
+        winSize=(KLT_WINDOW_PX, KLT_WINDOW_PX),
         maxLevel=3,
         criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,

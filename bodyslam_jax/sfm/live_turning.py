@@ -11,13 +11,11 @@ from jaxtyping import Float, Int
 
 from bodyslam_jax.geometry.triangulation import unit_rays
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
+from bodyslam_jax.sfm.live_map import MIN_INLIERS
 from bodyslam_jax.sfm.multiview import fit_rotation
 from bodyslam_jax.sfm.sfm import MAX_STATIC_MOTION_PX
 from bodyslam_jax.types import Intrinsics
 
-_MIN_INLIERS = 12
-"""Least number of inliers with which the camera is located, as on a map (`live_map`).
-"""
 _MIN_INLIER_SHARE = 0.5
 """Least share of inliers among the known points."""
 _MAX_ERROR_RAD = np.radians(1.5)
@@ -58,7 +56,7 @@ class TurningCamera:
         if self.still:
             return self.T_WC
         ray = self._rays(uv)
-        if self.points or len(ids) < _MIN_INLIERS:
+        if self.points or len(ids) < MIN_INLIERS:
             known = np.array([i in self.points for i in ids.tolist()], bool)
             points = [self.points[i] for i in ids[known].tolist()]
             if not self._take(np.array(points).reshape(-1, 3), ray[known]):
@@ -82,11 +80,11 @@ class TurningCamera:
     ) -> bool:
         """Fits the camera's rotation to directions and their rays, and returns false if
         too few fit. Rotations within the noise of tracks are not applied."""
-        if len(points) < _MIN_INLIERS:
+        if len(points) < MIN_INLIERS:
             return False
         R_CW, away = fit_rotation(points, ray, self.pixel)
         if (away < _MAX_ERROR_RAD).sum() < max(
-            _MIN_INLIERS, _MIN_INLIER_SHARE * len(points)
+            MIN_INLIERS, _MIN_INLIER_SHARE * len(points)
         ):
             return False
         moved = np.linalg.norm(points @ (R_CW.T - self.T_WC[:3, :3]), axis=1)

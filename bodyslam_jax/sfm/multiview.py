@@ -5,12 +5,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.geometry.arrays import SIGMA_OF_MEDIAN
 from bodyslam_jax.geometry.triangulation import unit_rays
 
-_NOISE_PER_MEDIAN = 1.4826
-"""Standard deviation of a normal error over its median absolute value."""
 _NOISE_PER_MEDIAN_OF_TWO = 0.8493
-"""The same over the median length of a vector of two errors: 1 / sqrt(2 ln 2)."""
+"""Standard deviation of normal errors over the median length of a vector of two: 1 /
+sqrt(2 ln 2)."""
 _VARIANCE_OF_LOG_RATIO = 1.9
 """Variance of the logarithm of the ratio of these two estimates from n pairs, times n:
 1.36 + 0.52 by the asymptotic variances of the two medians."""
@@ -182,9 +182,7 @@ def translation_is_told(
 
     **Arguments:** residuals of all pairs by `turn_with_focal` and by `sampson`.
     """
-    noise = max(
-        _NOISE_PER_MEDIAN * float(np.median(epipolar)), _LEAST_NOISE * threshold
-    )
+    noise = max(SIGMA_OF_MEDIAN * float(np.median(epipolar)), _LEAST_NOISE * threshold)
     needed = _NOISE_PER_MEDIAN_OF_TWO * float(np.median(turned))
     spread = (_VARIANCE_OF_LOG_RATIO / len(turned)) ** 0.5
     return bool(needed > noise * np.exp(_LEAST_LOG_RATIO * spread))

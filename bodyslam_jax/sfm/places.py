@@ -10,6 +10,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from bodyslam_jax.geometry.arrays import SIGMA_OF_MEDIAN
 from bodyslam_jax.sfm.features import match
 from bodyslam_jax.sfm.multiview import resect
 
@@ -108,4 +109,6 @@ def _covariance(
 
 def _spread(errors: np.ndarray) -> float:
     """Returns a robust standard deviation of errors about their median."""
-    return float(1.4826 * np.median(np.abs(errors - np.median(errors, axis=0))))
+    return float(
+        SIGMA_OF_MEDIAN * np.median(np.abs(errors - np.median(errors, axis=0)))
+    )

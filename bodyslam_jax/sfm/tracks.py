@@ -22,7 +22,13 @@ from bodyslam_jax.sfm.burnt_in import (
     MIN_MOVING_RATIO,
     still_limit,
 )
-from bodyslam_jax.sfm.features import epipolar_inliers, make_brisk, match, spread
+from bodyslam_jax.sfm.features import (
+    BRISK_THRESHOLD,
+    epipolar_inliers,
+    make_brisk,
+    match,
+    spread,
+)
 from bodyslam_jax.sfm.person_mask import person_masks
 from bodyslam_jax.types import Sequence, Tracks
 
@@ -31,13 +37,11 @@ _REFILL_GAP_FRAMES = 3
 _KEYFRAME_STEP_FRAMES = 12
 """Number of frames between two keyframes."""
 _NUM_KEYFRAMES = 12
-_MAX_ROUND_TRIP_PX = 0.5
+MAX_ROUND_TRIP_PX = 0.5
 """Largest forward-backward error of KLT, px: assumes that KLT localises a window to
 clearly better than that, in images of any size."""
 _MIN_BRISK_THRESHOLD = 6
 """Least threshold of BRISK, in images without contrast, grey levels."""
-_BRISK_THRESHOLD, _BRISK_OCTAVES = 20, 3
-"""Initial threshold of BRISK, grey levels, and number of octaves of its pyramid."""
 NUM_CELLS = 8
 """Number of cells along the longer side of the image, over which points are spread."""
 KLT_WINDOW_PX = 21
@@ -126,7 +130,7 @@ class _Tracker:
         self.config = config
         self.size = (sequence.intrinsics.width, sequence.intrinsics.height)
         self.K, self.distortion = as_opencv(sequence.intrinsics.params)
-        self.brisk = make_brisk(_BRISK_THRESHOLD, _BRISK_OCTAVES)
+        self.brisk = make_brisk()
         self.live = _Live(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
         self.previous: np.ndarray | None = None
         self.recent: deque[tuple[np.ndarray, np.ndarray]] = deque(
@@ -134,7 +138,7 @@ class _Tracker:
         )
         self.rows: list[tuple[int, np.ndarray, np.ndarray]] = []
         self.next_id = 0
-        self.threshold = _BRISK_THRESHOLD
+        self.threshold = BRISK_THRESHOLD
         self.last_refill = -_REFILL_GAP_FRAMES
         self.keyframes: deque[_Keyframe] = deque(maxlen=_NUM_KEYFRAMES)
         self.last_keyframe = -_KEYFRAME_STEP_FRAMES
@@ -173,7 +177,7 @@ class _Tracker:
         guess = live.uv + live.step
         uv, ok = self._flow(self.previous, image, live.uv, guess)
         back, ok_back = self._flow(image, self.previous, uv, live.uv)
-        ok &= ok_back & (np.linalg.norm(back - live.uv, axis=-1) < _MAX_ROUND_TRIP_PX)
+        ok &= ok_back & (np.linalg.norm(back - live.uv, axis=-1) < MAX_ROUND_TRIP_PX)
         ok &= self._inside(uv, mask)
         live.step, live.uv = uv - live.uv, uv
         self.live = live.keep(ok)
@@ -322,7 +326,7 @@ class _Tracker:
             then, guess = key.uv[lost[pairs[:, 0]]], candidates[pairs[:, 1]]
             now, ok = self._flow(key.image, gray, then, guess, 1)
             back, ok_back = self._flow(gray, key.image, now, then, 1)
-            ok &= ok_back & (np.linalg.norm(back - then, axis=-1) < _MAX_ROUND_TRIP_PX)
+            ok &= ok_back & (np.linalg.norm(back - then, axis=-1) < MAX_ROUND_TRIP_PX)
             ok &= np.linalg.norm(now - guess, axis=-1) < 4.0
             ids, then, now = key.ids[lost[pairs[ok, 0]]], then[ok], now[ok]
             _, a, b = np.intersect1d(key.ids, self.live.ids, return_indices=True)

@@ -9,6 +9,7 @@ people grow or shrink as they come nearer.
 import numpy as np
 from jaxtyping import Float
 
+from bodyslam_jax.geometry.arrays import SIGMA_OF_MEDIAN
 from bodyslam_jax.ground.plane import find_ground
 from bodyslam_jax.io.camera.calibration import as_opencv, rays
 from bodyslam_jax.sfm.sfm import Reconstruction
@@ -65,8 +66,7 @@ def plausibility(
         lean, size = _lean_and_size(person[which], found.T_WC[which], plane)
         if not len(size):
             continue
-        # Of a normal error, per median absolute value.
-        scatter = 1.4826 * np.median(np.abs(np.log(size / np.median(size))))
+        scatter = SIGMA_OF_MEDIAN * np.median(np.abs(np.log(size / np.median(size))))
         total += _student(np.median(lean) / _LEAN_SIGMA_RAD) + _student(
             scatter / _SIZE_SIGMA
         )

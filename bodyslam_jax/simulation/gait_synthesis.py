@@ -26,6 +26,8 @@ _BLEND_FRAMES = 10
 _MIN_PLAYED_FRAMES = 18
 """Duration of a trial between two blends at least."""
 _MAX_CLIPS = 40
+_MAX_TURN_RAD_S = np.radians(60.0)
+"""How quickly a walk is bent at most."""
 _LOOK_AHEAD_M = 1.2
 """Distance of the target point ahead on the path, m."""
 
@@ -72,15 +74,12 @@ def walk_along(
     path: Float[np.ndarray, "p 2"],
     num_frames: int,
     rng: np.random.Generator,
-    max_turn: float = np.radians(60.0),
 ) -> Walk:
-    """Returns `num_frames` of walking along the closed `path` (x, z in m).
-
-    `max_turn` (rad/s) limits how quickly the walk is bent; sharper corners are cut.
-    """
+    """Returns `num_frames` of walking along the closed `path` (x, z in m); corners
+    sharper than `_MAX_TURN_RAD_S` are cut."""
     library = _Library(person, [*clips, *map(mirror, clips)])
     plan = _join(library, num_frames, rng)
-    yaw = _steer(library, plan, path, max_turn)
+    yaw = _steer(library, plan, path)
     return _play(library, plan, yaw, path[0])
 
 
@@ -265,7 +264,7 @@ def _join(library: _Library, num_frames: int, rng: np.random.Generator) -> _Plan
 
 
 def _steer(
-    library: _Library, plan: _Plan, path: Float[np.ndarray, "p 2"], max_turn: float
+    library: _Library, plan: _Plan, path: Float[np.ndarray, "p 2"]
 ) -> Float[np.ndarray, " t"]:
     """Returns the yaw (rad) to add in each frame so that the walk follows the path
     (pure pursuit)."""
@@ -285,7 +284,7 @@ def _steer(
     start = at(_LOOK_AHEAD_M) - path[0]
     yaw = np.empty(len(a))
     previous = np.arctan2(start[0], start[1]) - heading[0]
-    limit = max_turn / FPS
+    limit = _MAX_TURN_RAD_S / FPS
     for k in range(len(a)):
         ahead = progress + np.linspace(0.0, 0.3, 7)
         gaps = [np.linalg.norm(at(s) - position) for s in ahead]

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int, UInt8
 from scipy.ndimage import zoom
 
 from bodyslam_jax.geometry import so3_numpy as so3
+from bodyslam_jax.simulation.room import TEXELS_PER_METRE
 
 _BASE_COLOURS = {
     "floor": (105, 125, 150),
@@ -126,10 +127,9 @@ def vertex_normals(
 
 
 def make_texture(
-    rng: np.random.Generator, height: int, width: int, kind: str, per_metre: float
+    rng: np.random.Generator, height: int, width: int, kind: str
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """Returns a texture for a floor, wall, ceiling or furniture, with `per_metre`
-    texels per metre.
+    """Returns a texture for a floor, wall, ceiling or furniture.
 
     BRISK finds corners in it at distances from half a metre to ten, and no part of it
     repeats.
@@ -138,15 +138,17 @@ def make_texture(
     base = base * rng.uniform(0.9, 1.1, 3)
     image = base * (1 + 0.22 * _clouds(rng, height, width))[:, :, None]
     if kind in ("floor", "ceiling"):
-        _tile(rng, image, per_metre * (0.5 if kind == "floor" else 0.6))
+        _tile(rng, image, TEXELS_PER_METRE * (0.5 if kind == "floor" else 0.6))
     if kind == "furniture":
         _grain(rng, image)
-    area = height * width / per_metre**2
+    area = height * width / TEXELS_PER_METRE**2
     for size, density in ((0.30, 0.8), (0.12, 4.0), (0.05, 16.0), (0.025, 30.0)):
         for _ in range(rng.poisson(density * area)):
-            _shape(rng, image, size * per_metre * rng.uniform(0.6, 1.5))
+            _shape(rng, image, size * TEXELS_PER_METRE * rng.uniform(0.6, 1.5))
     for _ in range(rng.poisson(1.5 * area)):
-        _letters(rng, image, max(1, round(0.012 * per_metre * rng.uniform(0.6, 2.5))))
+        _letters(
+            rng, image, max(1, round(0.012 * TEXELS_PER_METRE * rng.uniform(0.6, 2.5)))
+        )
     return np.clip(image, 0, 255).astype(np.uint8)
 
 

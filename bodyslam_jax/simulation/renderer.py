@@ -36,8 +36,6 @@ _MIPMAP_LEVELS = 7
 _BORDER_TEXELS = 2
 _LEVEL_SCALES = np.float32(0.5) ** np.arange(_MIPMAP_LEVELS, dtype=np.float32)
 """Factor on texture coordinates for each level."""
-_TEXELS_PER_METRE = 130.0
-"""Resolution of textures: a camera of 525 px sees texels at a scale of 1 from 4 m."""
 _NOISE_GREY_LEVELS = 1.5
 """Standard deviation of the image noise at medium grey."""
 _MAX_BLUR_IMAGES = 6
@@ -108,9 +106,9 @@ class Renderer:
         self.size = size
         self.shutter = shutter
         self.surfaces = room.faces()
-        self.extents = [texture_size(s, _TEXELS_PER_METRE) for s in self.surfaces]
+        self.extents = [texture_size(s) for s in self.surfaces]
         textures = [
-            make_texture(rng, int(h), int(w), s.kind, _TEXELS_PER_METRE)
+            make_texture(rng, int(h), int(w), s.kind)
             for s, (h, w) in zip(self.surfaces, self.extents, strict=True)
         ]
         azimuth, height = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(45, 75))

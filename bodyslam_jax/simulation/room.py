@@ -25,6 +25,10 @@ Height = Callable[[Float[np.ndarray, "*n 2"]], Float[np.ndarray, "*n"]]
 TILE_LENGTH_M = 0.35
 """Length of the tiles that make up a floor, and of a step of stairs."""
 _UP = np.array([0.0, 1.0, 0.0])
+TEXELS_PER_METRE = 130.0
+"""Resolution of textures: a camera of 525 px sees texels at a scale of 1 from 4 m."""
+_MAX_HIDDEN_SHARE = 0.35
+"""Share of the time for which occluding objects may hide the first person's feet."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,14 +172,12 @@ def put_in_the_way(
     people: Sequence[Float[np.ndarray, "t 3"]],
     camera: Float[np.ndarray, "t 3"],
     rng: np.random.Generator,
-    *,
-    most_hidden: float = 0.35,
 ) -> Room:
     """Returns the room with up to three more objects that occlude people temporarily.
 
     They are low cupboards, which occlude legs, and pillars. They stand between the
     camera and the first person, off both paths, and occlude that person's feet for a
-    share of at most `most_hidden` of the time.
+    share of at most `_MAX_HIDDEN_SHARE` of the time.
     """
     ways = np.concatenate([*people, camera])[::3, [0, 2]]
     pelvis = people[0]
@@ -199,7 +201,7 @@ def put_in_the_way(
             more.is_hidden(c, p[None])[0]
             for c, p in zip(camera[::3], feet, strict=True)
         ]
-        if np.mean(hidden) > most_hidden:
+        if np.mean(hidden) > _MAX_HIDDEN_SHARE:
             continue
         room, placed = more, placed + 1
         if placed == 3:
@@ -243,11 +245,10 @@ def landmarks_on(
     return np.concatenate(points), np.concatenate(normals)
 
 
-def texture_size(surface: Surface, per_metre: float) -> Int[np.ndarray, "2"]:
-    """Returns height and width of a surface's texture at `per_metre` texels per
-    metre."""
+def texture_size(surface: Surface) -> Int[np.ndarray, "2"]:
+    """Returns height and width of a surface's texture, texels."""
     edges = np.linalg.norm([surface.edge_v, surface.edge_u], axis=1)
-    return np.maximum(np.round(per_metre * edges), 8).astype(np.int64)
+    return np.maximum(np.round(TEXELS_PER_METRE * edges), 8).astype(np.int64)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -50,6 +50,8 @@ _GRID_CELLS = (8, 6)
 _MAX_CANDIDATES = 700
 """Number of candidate points per image that are tested for visibility at most, to bound
 the run time."""
+_NUM_TRACKS = 200
+"""Number of tracks per frame that are aimed at."""
 _BORDER_PX = 3.0
 """Distance from the image's edge at which tracks end, px."""
 _HANDS_FEET = np.isin(np.arange(24), (*ANKLES, *FEET, *WRISTS, *HANDS))
@@ -370,10 +372,9 @@ def track_points(
     rng: np.random.Generator,
     *,
     life: float,
-    wanted: int = 200,
 ) -> tuple[Tracks, Float[np.ndarray, "l 3"]]:
-    """Returns about `wanted` tracks per frame, spread over the image, and their true
-    points (m).
+    """Returns about `_NUM_TRACKS` tracks per frame, spread over the image, and their
+    true points (m).
 
     A track ends when its point leaves the image or is occluded by furniture or a
     person, and at random after `life` frames on average; a point observed again starts
@@ -403,10 +404,10 @@ def track_points(
         visible[:] = False
         visible[some] = True
         alive = alive[visible[alive[:, 1]] & (rng.random(len(alive)) > 1 / life)]
-        if len(alive) < wanted:
+        if len(alive) < _NUM_TRACKS:
             fresh = _spread(
                 uv, some[~np.isin(some, alive[:, 1])], strength, alive[:, 1], size,
-                wanted - len(alive),
+                _NUM_TRACKS - len(alive),
             )  # fmt: skip
             new = np.stack([count + np.arange(len(fresh)), fresh], axis=1)
             alive = np.concatenate([alive, new])

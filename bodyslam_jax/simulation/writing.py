@@ -96,23 +96,19 @@ def demo_settings(seed: int = 0) -> Simulation:
 def demo_scene(
     folder: Path,
     seed: int = 0,
-    simulated: SimulatedSequence | None = None,
     *,
     people: bool = True,
 ) -> Path:
     """Renders the demo: a walker whom a moving camera follows.
 
     Writes a sequence folder without tracks, so that they are computed from the video.
-    An existing scene of the same seed is kept. `simulated` is the demo's scene of that
-    seed, if it was simulated already. Without `people` there are neither keypoints nor
-    bodies, so that people are detected in the video, too.
+    An existing scene of the same seed is kept. Without `people` there are
+    neither keypoints nor bodies, so that people are detected in the video, too.
     """
     settings = demo_settings(seed)
     if _earlier(Path(folder)) == _mark(settings, False, people):
         return Path(folder)
-    if simulated is None:
-        simulated = simulate(settings)
-    return write_sequence(folder, simulated, tracks=False, people=people)
+    return write_sequence(folder, simulate(settings), tracks=False, people=people)
 
 
 def film_scene(folder: Path, simulated: SimulatedSequence) -> Path:

@@ -232,9 +232,7 @@ def in_line(
     return _line(dtype, [*parts, *diagonal["landmarks"]])
 
 
-def gradient_in_line(
-    lin: Linearisation, sizes: Sizes, move: Move
-) -> Float[Array, " d"]:
+def gradient_in_line(lin: Linearisation, move: Move) -> Float[Array, " d"]:
     """Returns the gradient in one vector, in the order of `in_line`."""
     step, gradient = move.step, lin.gradient
     camera = gradient.get("camera_alone", jnp.zeros_like(step.cameras))

@@ -118,7 +118,7 @@ def attempt(
     moved = along(problem, sizes, move)
     line = lambda known: in_line(known, moved.dtype, move.postures)
     length = jnp.sum(line(diagonal) * moved**2)
-    slope = -jnp.sum(gradient_in_line(lin, sizes, move) * moved)
+    slope = -jnp.sum(gradient_in_line(lin, move) * moved)
     predicted = 0.5 * (jnp.sum(line(extra) * moved**2) + slope)
     finite = jnp.isfinite(predicted) & jnp.isfinite(length) & ~last
     move = jax.tree.map(lambda x: jnp.where(finite, x, 0.0), move)

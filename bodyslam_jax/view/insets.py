@@ -13,6 +13,7 @@ from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.types import Result, Tracks
 from bodyslam_jax.view.style import (
     CAMERA,
+    MIN_DEPTH_M,
     POINT,
     SUBPIXELS,
     Color,
@@ -29,8 +30,6 @@ _GAP_PX = 4
 """Distance between the plan and the side view, px."""
 _BODY_RADIUS_M = 0.15
 """Distance of the skin from the joints: half a trunk, a hand beyond its wrist; m."""
-_MIN_DEPTH_M = 0.05
-"""Joints nearer to the camera's plane than this are not visible, m."""
 _COLUMN_COLOR = (28, 28, 28)
 """Colour of the column beside the image, BGR."""
 _MAX_SPAN_M = 8.0
@@ -103,10 +102,10 @@ def _hits(
     reach[..., -1] = radius
     R, eye = result.T_WC[:, :3, :3], result.T_WC[:, None, :3, 3]
     p_C = np.einsum("tji,htkj->htki", R, points - eye)
-    shown = result.present[..., None] & (p_C[..., 2] > _MIN_DEPTH_M)
+    shown = result.present[..., None] & (p_C[..., 2] > MIN_DEPTH_M)
     uv = (_projected(result, p_C) + 0.5) * zoom - 0.5
     focal = result.intrinsics[:2] * zoom
-    reach = reach * focal.max() / np.maximum(p_C[..., 2], _MIN_DEPTH_M)
+    reach = reach * focal.max() / np.maximum(p_C[..., 2], MIN_DEPTH_M)
     low = np.asarray(corner, float)
     away = np.maximum(np.maximum(low - uv, uv - low - size), 0.0)
     return int((shown & (np.linalg.norm(away, axis=-1) < reach)).sum())
@@ -115,7 +114,7 @@ def _hits(
 def _projected(
     result: Result, p_C: Float[np.ndarray, "h t k 3"]
 ) -> Float[np.ndarray, "h t k 2"]:
-    safe = np.where(p_C[..., 2:] > _MIN_DEPTH_M, p_C, [0.0, 0.0, 1.0])
+    safe = np.where(p_C[..., 2:] > MIN_DEPTH_M, p_C, [0.0, 0.0, 1.0])
     cast = lambda x: jnp.asarray(x, jnp.float32)
     return np.asarray(project(cast(result.intrinsics), cast(safe)), np.float64)
 

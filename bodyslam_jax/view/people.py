@@ -20,6 +20,7 @@ from bodyslam_jax.diagnostics.reported_status import inferred_bones
 from bodyslam_jax.geometry.camera import project
 from bodyslam_jax.types import Result
 from bodyslam_jax.view.style import (
+    MIN_DEPTH_M,
     PALE,
     SUBPIXELS,
     Image,
@@ -30,8 +31,6 @@ from bodyslam_jax.view.style import (
 
 _CELL_M = 0.025
 """Size of the cells in which vertices are merged, m."""
-_MIN_DEPTH_M = 0.05
-"""Triangles nearer to the camera's plane than this are not drawn, m."""
 _MAX_STILL_WIDTH_PX = 960
 """Greatest width of a still, px."""
 _MIN_CONTOUR_PX = 12
@@ -190,7 +189,7 @@ def draw_people(
         a, b, c = (mesh.p_C[faces[:, k]] for k in range(3))
         normal = np.cross(b - a, c - a)
         faces_camera = np.sum(normal * a, 1) < 0
-        before = np.minimum(np.minimum(a[:, 2], b[:, 2]), c[:, 2]) > _MIN_DEPTH_M
+        before = np.minimum(np.minimum(a[:, 2], b[:, 2]), c[:, 2]) > MIN_DEPTH_M
         triangle = uv[faces]
         inside = np.all(triangle.max(1) >= -0.5, 1) & np.all(
             triangle.min(1) <= [width - 0.5, height - 0.5], 1

@@ -31,6 +31,8 @@ PEOPLE: tuple[Color, ...] = (
     (70, 110, 170),
 )
 """Of camera, tracked points and people, as in the report."""
+MIN_DEPTH_M = 0.05
+"""Depth from which points of bodies are drawn, m."""
 PALE = 0.8
 """Share of white in the colour of a limb that was inferred, not measured."""
 _LINE_HEIGHT_PX, _SAMPLE_LENGTH_PX = 17, 26
@@ -167,11 +169,10 @@ class Legend:
             y -= _LINE_HEIGHT_PX
 
 
-def write_names(
-    image: Image, names: list[tuple[str, tuple[float, float]]], size: float = 0.45
-) -> None:
+def write_names(image: Image, names: list[tuple[str, tuple[float, float]]]) -> None:
     """Writes names above their positions (px), moved up where they would cover each
     other."""
+    size = 0.45
     high, wide = 15.0, 17.0 * size
     taken: list[tuple[float, float, float]] = []
     for text, (u, v) in sorted(names, key=lambda item: item[1]):

@@ -18,7 +18,6 @@ from bodyslam_jax.export.formats.scene import Scene, at_constant_rate
 
 _BLOCK_BYTES = 512
 """Size of a block (the C3D file format, section "Basic structure")."""
-_HEADER_WORDS = _BLOCK_BYTES // 2
 _PARAMETER_KEY, _INTEL_PROCESSOR = 0x50, 84
 """The format's marks of a parameter section, and of numbers of Intel's order."""
 _MAX_FRAMES = 65535

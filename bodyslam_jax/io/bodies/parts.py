@@ -205,13 +205,11 @@ def as_rotvec(array: np.ndarray, joints: int | None) -> np.ndarray:
     )
 
 
-def rotations_of(data: dict, key: str, joints: int) -> np.ndarray:
-    array = numbers_of(data, key, None)
-    if array.shape[1:] not in ((3 * joints,), (joints, 3), (joints, 3, 3)):
-        raise InvalidContent(
-            f"`{key}` is {array.shape}, not rotations of {joints} joints"
-        )
-    return as_rotvec(array, joints)
+def pose_of(data: dict) -> np.ndarray:
+    array = numbers_of(data, "pose", None)
+    if array.shape[1:] not in ((72,), (24, 3), (24, 3, 3)):
+        raise InvalidContent(f"`pose` is {array.shape}, not rotations of 24 joints")
+    return as_rotvec(array, 24)
 
 
 def middle(camera: Intrinsics) -> np.ndarray:

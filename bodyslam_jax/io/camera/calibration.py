@@ -68,7 +68,7 @@ def read_camera(
         return _from_cameras(path, [arkit.read_arkit_camera(path, size)], size), None
     named = read_named_cameras(path)
     if named is not None:
-        chosen = _choose_camera(path, named, wanted, size, video)
+        chosen = _choose_camera(path, named, wanted, video)
         size = chosen.size or size
         if size is None:
             raise InputError(f"{path}: of what image size? It needs the video.")
@@ -155,14 +155,12 @@ def _choose_camera(
     path: Path,
     cameras: Iterable[NamedCamera],
     wanted: str | None,
-    size: tuple[int, int] | None,
     video: str,
 ) -> NamedCamera:
     """Returns the camera of the video among those of a file.
 
     Args:
         wanted: its name, or its number from 0, as the user gave it.
-        size: of the video, px.
         video: name of the video, which may name the camera.
 
     **Raises:** `InputError`, naming the file and its cameras, if it is not clear.

@@ -49,7 +49,8 @@ _MIN_MIRRORED_SHARE = 0.7
 _MIN_DETECTIONS = 10
 """Least number of detections for a decision about x and y."""
 _MIN_PRESENT_CONFIDENCE = 0.05
-_MIN_CONFIDENCE = 0.3
+MIN_CONFIDENCE = 0.3
+"""Least confidence of a keypoint whose position is trusted."""
 _NECK, _MID_HIP = BODY25["neck"], BODY25["mid_hip"]
 _RIGHT, _LEFT = (
     (BODY25[f"{side}_shoulder"], BODY25[f"{side}_hip"]) for side in ("right", "left")
@@ -316,7 +317,7 @@ def lying(points: Float[np.ndarray, "n 25 3"], has_face: bool) -> Lying:
     trunk = points[:, _MID_HIP, :2] - points[:, _NECK, :2]
     length = np.maximum(np.linalg.norm(trunk, axis=1), 1e-9)
     flat = trunk[:, 0] > np.cos(np.radians(_MAX_TRUNK_SLOPE_DEG)) * length
-    sure = points[..., 2] > _MIN_CONFIDENCE
+    sure = points[..., 2] > MIN_CONFIDENCE
     sides = zip(_RIGHT, _LEFT, strict=True)
     across = [points[:, r, 1] - points[:, l, 1] for r, l in sides]
     breadth = np.mean(across, axis=0) / length

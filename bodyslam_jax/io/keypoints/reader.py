@@ -25,7 +25,7 @@ from bodyslam_jax.io.budget import MAX_PEOPLE
 from bodyslam_jax.io.declared_size import Size, factor_to, scaled
 from bodyslam_jax.io.formats import attributed, format_of, names_of
 from bodyslam_jax.io.frame_index import InvalidContent, Warn, frames_of_names
-from bodyslam_jax.io.keypoints.arrange import arranged
+from bodyslam_jax.io.keypoints.arrange import MIN_CONFIDENCE, arranged
 from bodyslam_jax.io.keypoints.keypoint_format import (
     Listed,
     keypoint_formats,
@@ -36,8 +36,6 @@ from bodyslam_jax.io.keypoints.layouts import usual_layout
 _log = logging.getLogger(__name__)
 Detections = list[np.ndarray]
 """For each frame the keypoints (n, 25, 3) of `n` people: u px, v px, confidence."""
-_MIN_CONFIDENCE = 0.3
-"""Least confidence of a keypoint whose position is trusted."""
 _MIN_OUTSIDE_SHARE, _MIN_INSIDE_SHARE = 0.02, 0.995
 """Least share of points outside the video, and within the rotated one, of keypoints in
 the stored frames of a phone's video, before its rotation tag."""
@@ -189,7 +187,7 @@ def _to_pixels(
     present = points[..., 2] > 0
     if not present.any():
         raise InputError(f"{path}: all confidences are zero.")
-    sure = points[..., 2] > _MIN_CONFIDENCE
+    sure = points[..., 2] > MIN_CONFIDENCE
     sure = sure if sure.any() else present
     if (uv := _relative(points, sure, size, warn)) is not None:
         points[..., :2] = uv
@@ -199,7 +197,7 @@ def _to_pixels(
         except InvalidContent as error:
             raise InputError(f"{path}: {error}") from None
         points[..., :2] = scaled(points[..., :2], factor)
-    at = points[points[..., 2] > _MIN_CONFIDENCE][:, :2]
+    at = points[points[..., 2] > MIN_CONFIDENCE][:, :2]
     outside = ((at < 0) | (at > size)).any(axis=-1)
     if (turned := _rotated_upright(points, sure, size, warn)) is not None:
         points[..., :2] = turned

@@ -273,15 +273,12 @@ def judge_contact(
     body: BodyModel,
     dataset: Sequence[Clip],
     drift_deg: float = 0.0,
-    *,
-    root_drift: float = 0.5,
-    seed: int = 0,
 ) -> dict[str, float]:
     """Evaluates a contact network on clips whose postures have errors as in training.
 
     The standard deviation of slow errors is `drift_deg` per joint axis (1.5 times that
-    at hands and feet), that of white noise 0.4 degrees; errors of the root's
-    orientation are multiplied by `root_drift`.
+    at hands and feet), and white noise is added; errors of the root's
+    orientation are half as large.
 
     Returns `precision` and `recall` of points with a probability above one half,
     `share` (of points in contact), `probability` (mean) and `slip`: root mean square
@@ -302,11 +299,9 @@ def judge_contact(
     body, model = in_dtype(body, jnp.float32), in_dtype(model, jnp.float32)
     seen = poses
     if drift_deg > 0:
-        sigma, white = np.deg2rad(drift_deg), np.deg2rad(0.4)
-        keys = jax.random.split(jax.random.key(seed), len(trials))
-        seen = disturbed(
-            poses, keys, *(jnp.float32(x) for x in (sigma, white, root_drift))
-        )
+        sigma = jnp.float32(np.deg2rad(drift_deg))
+        keys = jax.random.split(jax.random.key(0), len(trials))
+        seen = disturbed(poses, keys, sigma, jnp.float32(0.5))
     exact = np.asarray(_points(body, poses, trans, shape))
     noisy = np.asarray(_points(body, seen, trans, shape))
     guess = np.asarray(_contacts(model, body, seen, shape, jnp.asarray(present)))

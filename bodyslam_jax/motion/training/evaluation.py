@@ -36,6 +36,9 @@ _CHI2_95 = 7.815
 DRIFTS_DEG = (0.0, 5.0, 9.0)
 """Standard deviations of slow joint-angle errors at which a model is evaluated,
 degrees."""
+_WHITE_DEG = 0.4
+"""Standard deviation of white joint-angle errors beside slow ones, degrees: two thirds
+of the largest in training."""
 TARGET_RATIOS = (0.10, 0.13, 0.18)
 """Target ratio of error to displacement at each drift."""
 
@@ -120,14 +123,12 @@ def run_trials(
     drift_deg: float,
     *,
     seed: int = 0,
-    white_deg: float = 0.4,
-    root_drift: float = 0.0,
 ) -> Steps:
     """Predicts all trials from postures with errors of a given size.
 
     `drift_deg` is the standard deviation of slow errors per joint axis (1.5 times that
-    at hands and feet); if it is positive, `white_deg` of white noise is added. Errors
-    of the root's orientation are multiplied by `root_drift`.
+    at hands and feet); if it is positive, white noise is added. The root's orientation
+    has no errors.
     """
     length = max(len(trial.trans) for trial in trials)
     length = -(-length // 64) * 64
@@ -146,8 +147,7 @@ def run_trials(
                 jnp.asarray(poses),
                 jax.random.split(jax.random.key(seed), len(trials)),
                 jnp.deg2rad(jnp.float32(drift_deg)),
-                jnp.deg2rad(jnp.float32(white_deg)),
-                jnp.float32(root_drift),
+                jnp.float32(0.0),
             )
         )
     chunk = 16
@@ -166,9 +166,10 @@ def run_trials(
 
 
 @jax.jit
-def disturbed(poses, keys, sigma, white, root):
-    """Adds errors (rad) to postures of clips; those of the root are scaled by
-    `root`."""
+def disturbed(poses, keys, sigma, root):
+    """Adds errors to postures of clips: slow ones of `sigma` (rad) and white noise;
+    those of the root are scaled by `root`."""
+    white = jnp.deg2rad(jnp.float32(_WHITE_DEG))
     noise = jax.vmap(drift, (0, None, None, None))(keys, poses.shape[1], sigma, white)
     return disturb(poses, noise.at[:, :, 0].multiply(root))
 
@@ -180,7 +181,6 @@ def evaluate_model(
     drift_deg: float = 0.0,
     *,
     seeds: int = 3,
-    root_drift: float = 0.0,
     skip: int = 0,
     constant: Float[np.ndarray, " 3"] | None = None,
 ) -> dict[str, dict[str, float]]:
@@ -199,10 +199,7 @@ def evaluate_model(
     clips = resample(clips, FPS)
     trials = place(body, clips)
     draws = range(seeds if drift_deg > 0 else 1)
-    runs = [
-        run_trials(model, body, trials, drift_deg, seed=i, root_drift=root_drift)
-        for i in draws
-    ]
+    runs = [run_trials(model, body, trials, drift_deg, seed=i) for i in draws]
     steps = Steps(*(np.concatenate(x) for x in zip(*runs, strict=True)))
     valid = steps.valid.copy()
     valid[:, : max(skip, 2)] = False

@@ -33,7 +33,6 @@ def compare(
     clips: Sequence[Clip],
     *,
     training: Sequence[Clip] = (),
-    drifts: Sequence[float] = DRIFTS_DEG,
     seeds: int = 3,
 ) -> list[dict[str, str | float]]:
     """Evaluates several models on the same steps of the same clips, with baselines.
@@ -42,17 +41,14 @@ def compare(
     velocity; and one of the mean displacement of `training` clips, if given.
     `write_table` formats them.
 
-    **Raises:** `InputError` without models or drifts.
+    **Raises:** `InputError` without models.
     """
-    if not len(models) or not len(drifts):
-        raise InputError(
-            f"compare: {len(models)} models and {len(drifts)} drifts, expected one of "
-            "each or more."
-        )
+    if not models:
+        raise InputError("compare: no models, expected one or more.")
     skip = max(model.past for model in models.values()) + 1
     rows, steady = [], {}
     for name, model in models.items():
-        for drift_deg in drifts:
+        for drift_deg in DRIFTS_DEG:
             found = evaluate_model(
                 model, body, clips, drift_deg, seeds=seeds, skip=skip
             )
@@ -109,7 +105,6 @@ def draw_errors(
     body: BodyModel,
     clips: Sequence[Clip],
     path: Path,
-    drifts: Sequence[float] = DRIFTS_DEG,
 ) -> None:
     """Draws histograms of the translation error in x, y, z of H, as figure 7 of the
     paper, to an image file."""
@@ -119,7 +114,7 @@ def draw_errors(
     figure = Figure((9, 2.8), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     bins = np.linspace(-30, 30, 61)
-    for drift_deg in drifts:
+    for drift_deg in DRIFTS_DEG:
         steps = run_trials(model, body, trials, drift_deg)
         error = 1e3 * (steps.predicted - steps.true)[steps.valid]
         for axis, values in zip(axes, error.T, strict=True):

@@ -31,7 +31,7 @@ class BodiesNpz(BodyFormat):
 
     def read(self, source: Source, video: Video) -> Rows:
         data = source.content
-        regressed = _flag(data, "shapes_regressed", default=True)
+        regressed = _shapes_regressed(data)
         if "trans" not in data:
             if "camera" not in data:
                 raise InvalidContent("neither `trans` nor `camera` and `bbox`")
@@ -76,8 +76,9 @@ def _as_smpl(data: dict) -> dict:
     return {**data, "poses": poses72, "betas": betas}
 
 
-def _flag(data: dict, key: str, default: bool) -> bool:
-    value = np.asarray(data.get(key, default))
+def _shapes_regressed(data: dict) -> bool:
+    value = np.asarray(data.get("shapes_regressed", True))
     if value.size != 1 or value.item() not in (0, 1):
-        raise InvalidContent(f"`{key}` is {str(value)[:40]}, not true or false")
+        found = str(value)[:40]
+        raise InvalidContent(f"`shapes_regressed` is {found}, not true or false")
     return bool(value.item())

@@ -11,8 +11,8 @@ from bodyslam_jax.io.bodies.parts import (
     frames_of_images,
     middle,
     numbers_of,
+    pose_of,
     refocused,
-    rotations_of,
     tell_apart,
 )
 from bodyslam_jax.io.formats import Source
@@ -37,7 +37,7 @@ class Cliff(BodyFormat):
 
     def read(self, source: Source, video: Video) -> Rows:
         data = source.content
-        poses = rotations_of(data, "pose", 24)
+        poses = pose_of(data)
         n = len(poses)
         if "imgname" in data:
             names = [str(name) for name in np.ravel(data["imgname"])]
