@@ -34,6 +34,12 @@ LIMITS = (
 def shrink(x, share=0.9):
     # Twice the noise of tracks.
     return x * 1.4 if x > 17 else share
+
+# Measured on walks.
+_TABLE = {
+    "walk": 0.3,
+    "run": 0.7,
+}
 """
     assert found(text) == [
         ("_LIMIT", 0.35, True),
@@ -43,6 +49,8 @@ def shrink(x, share=0.9):
         ("shrink", 0.9, False),
         ("shrink", 1.4, True),
         ("shrink", 17, True),
+        ("_TABLE", 0.3, True),
+        ("_TABLE", 0.7, True),
     ]
 
 
@@ -57,6 +65,7 @@ def shrink(x, share=0.9):
         "JOINTS = (5, 7, 11, 13)",
         "def f(x: Float[Array, '5 7']) -> None: ...",
         "np.mean(x, axis=5)",
+        "axis.plot(x, lw=1.3, alpha=0.7)",
         "x = -0.5 * y + 2 * z - 1",
     ],
 )

@@ -7,9 +7,10 @@ their negatives, a half, indices and slices, axes, shapes and sizes of arrays, r
 numbers inside text, exponents of powers, integers in a table (a tuple or list of more
 than three), and the dimensions of vectors, rotations and body models. Units are powers
 of ten, and what converts degrees, minutes, bytes and colours. A number has a source if
-a docstring follows its name, a comment is on its line or the one before, or it is an
-argument of a call that names its `source`. `--list`
-prints every literal, `--without-source` only those without one.
+a docstring follows its name, a comment is on its line or before it (or before the
+statement of several lines that it is in), or it is an argument of a call that names its
+`source`. The look of charts (sizes of fonts and lines) is no estimate and does not
+count. `--list` prints every literal, `--without-source` only those without one.
 """
 
 import argparse
@@ -27,7 +28,12 @@ _SHAPES = {
     *("repeat", "expand_dims", "swapaxes", "moveaxis", "transpose", "range", "arange"),
     *("round", "split", "rsplit", "take", "stack", "concatenate", "ljust", "rjust"),
 }
-_NOT_CHOSEN = {"axis", "ndim", "dtype", "indent", "stacklevel", "width", "decimals"}
+_NOT_CHOSEN = {
+    *("axis", "ndim", "dtype", "indent", "stacklevel", "width", "decimals"),
+    # The look of a chart: no estimate depends on it.
+    *("fontsize", "title_fontsize", "markersize", "lw", "linewidth", "dpi", "alpha"),
+    *("rotation", "figsize", "ncols", "zorder"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +52,7 @@ def literals(text: str) -> list[Literal]:
     tree = ast.parse(text)
     lines = text.splitlines()
     commented = {k + 1 for k, line in enumerate(lines) if "#" in line}
-    documented = _documented(tree)
+    documented = _documented(tree) | _below_a_comment(tree, lines)
     found = []
     place = lambda one: (one[0].lineno, one[0].col_offset)
     for node, name in sorted(_numbers(tree, "module"), key=place):
@@ -71,6 +77,16 @@ def _documented(tree: ast.AST) -> set[int]:
             )
             if isinstance(one, ast.Assign | ast.AnnAssign) and is_text:
                 found |= set(range(one.lineno, (one.end_lineno or one.lineno) + 1))
+    return found
+
+
+def _below_a_comment(tree: ast.AST, lines: list[str]) -> set[int]:
+    """Lines of simple statements that a line of comment precedes."""
+    found = set()
+    for node in ast.walk(tree):
+        is_simple = isinstance(node, ast.stmt) and not hasattr(node, "body")
+        if is_simple and lines[node.lineno - 2].lstrip().startswith("#"):
+            found |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
     return found
 
 

@@ -121,6 +121,7 @@ def _turning_point(k1: Array, k2: Array) -> Array:
     It is the smallest positive root of `1 + 3 k1 q + 5 k2 q^2`, written as `2 / (-b +
     sqrt)` so that `k2 = 0` needs no special case.
     """
+    # b² - 4ac of that polynomial.
     b, discriminant = 3 * k1, 9 * k1 * k1 - 20 * k2
     real = discriminant >= 0
     denominator = -b + jnp.sqrt(jnp.where(real, discriminant, 0.0))

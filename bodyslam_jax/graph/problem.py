@@ -456,14 +456,16 @@ def _sample_state(free: Step) -> State:
     eye = lambda x: (
         jnp.zeros((*x.shape[:-1], 4, 4), x.dtype) + jnp.eye(4, dtype=x.dtype)
     )
+    # Convention: an image of 640x480 px, seen from 3 m; any regular state will do.
+    depth, pinhole = 3.0, jnp.array([500.0, 500.0, 320.0, 240.0])
     intrinsics = jnp.zeros_like(free.intrinsics)
     return State(
         scale=jnp.ones_like(free.scale),
         cameras=eye(free.cameras),
-        roots=eye(free.roots).at[..., 2, 3].set(3.0),
+        roots=eye(free.roots).at[..., 2, 3].set(depth),
         poses=jnp.zeros_like(free.poses),
         shapes=jnp.zeros_like(free.shapes),
-        landmarks=jnp.zeros_like(free.landmarks).at[:, 2].set(3.0),
-        intrinsics=intrinsics.at[:4].set(jnp.array([500.0, 500.0, 320.0, 240.0])),
+        landmarks=jnp.zeros_like(free.landmarks).at[:, 2].set(depth),
+        intrinsics=intrinsics.at[:4].set(pinhole),
         globals=jnp.zeros_like(free.globals),
     )

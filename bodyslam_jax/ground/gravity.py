@@ -52,9 +52,10 @@ _COMMON_TRUNK_SHARE = 0.65
 detector sees them from one side: averaging over people does not reduce it. Assumed; the
 sequences with a known up direction show one or two people."""
 _TRUNK_OUTLIER_PROBABILITY = {False: 0.05, True: 0.15}
-_TRUNK_OUTLIER_FACTOR = 2.5
 """Probability that a person's trunk is an outlier, by whether bodies are fitted to
-keypoints, and the factor by which its standard deviation is then larger."""
+keypoints."""
+_TRUNK_OUTLIER_FACTOR = 2.5
+"""Factor on the standard deviation of a trunk that is an outlier."""
 _EDGE_OUTLIERS = (0.1, 5.0 * _DEGREE)
 """Probability that edges which agree are not vertical, and the standard deviation of
 their direction in that case, rad. Assumed: they were vertical in all 21 clips."""

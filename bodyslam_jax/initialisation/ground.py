@@ -66,6 +66,7 @@ def ground_contact(
     contact, used = _ground(state, visible, body, fps)
     if contact is None:
         return None
+    # Definition: quartiles.
     low, middle, high = np.quantile(scales(contact, state)[used], [0.25, 0.5, 0.75])
     if low <= 0 or high - low >= _MAX_SPREAD * middle:
         return None
@@ -185,6 +186,7 @@ def _ground(
 
 def _range(values: Float[np.ndarray, " n"]) -> float:
     """Returns the range from the 5th to the 95th percentile over the median."""
+    # Convention: the middle 90 %, which single outliers do not change.
     low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
     return float((high - low) / max(abs(middle), 1e-12))
 

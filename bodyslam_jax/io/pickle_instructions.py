@@ -14,6 +14,7 @@ import numpy as np
 from bodyslam_jax.io.pickle_machine import (
     BLOB_BYTES,
     OBJECT_BYTES,
+    REFERENCE_BYTES,
     Blob,
     Instruction,
     Machine,
@@ -124,7 +125,7 @@ def _of_marked(make: Callable[[Machine, list], Any]) -> Instruction:
 
     def step(machine: Machine) -> None:
         items = machine.pop_mark()
-        machine.push(make(machine, items), OBJECT_BYTES + 8 * len(items))
+        machine.push(make(machine, items), OBJECT_BYTES + REFERENCE_BYTES * len(items))
 
     return step
 
@@ -190,7 +191,9 @@ def _put(layout: str) -> Instruction:
 
 def _get(layout: str) -> Instruction:
     place = struct.Struct(layout)
-    return lambda machine: machine.push(machine.memo[machine.number(place)], 8)
+    return lambda machine: machine.push(
+        machine.memo[machine.number(place)], REFERENCE_BYTES
+    )
 
 
 def _place(machine: Machine) -> int:
@@ -202,12 +205,12 @@ def _place(machine: Machine) -> int:
 
 def _global(machine: Machine) -> None:
     module, name = machine.line().decode(), machine.line().decode()
-    machine.push(machine.named(module, name), 8)
+    machine.push(machine.named(module, name), REFERENCE_BYTES)
 
 
 def _stack_global(machine: Machine) -> None:
     name, module = machine.stack.pop(), machine.stack.pop()
-    machine.push(machine.named(module, name), 8)
+    machine.push(machine.named(module, name), REFERENCE_BYTES)
 
 
 def _reduce(machine: Machine) -> None:

@@ -46,6 +46,8 @@ STOP = ord(".")
 """The instruction that ends a pickle."""
 MAX_DEPTH = 64
 """Largest number of levels of nesting; results of tools have 10 at most."""
+REFERENCE_BYTES = 8
+"""Size of a reference to a value, bytes: a pointer of 64 bits."""
 OBJECT_BYTES = 300
 """Memory of a container, bytes: an empty set, the largest, takes 240."""
 BLOB_BYTES = 4096
@@ -180,7 +182,7 @@ class Plain:
 
     def _visit_all(self, values: Any, depth: int) -> tuple[list[Any], int, int]:
         items, size, levels = [], 2 * VALUE_BYTES, 0
-        self.account.spend(8 * len(values))
+        self.account.spend(REFERENCE_BYTES * len(values))
         for value in values:
             item, more, deep = self._visit(value, depth + 1)
             items.append(item)

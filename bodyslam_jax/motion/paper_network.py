@@ -48,7 +48,7 @@ class PaperNetwork(MotionNetwork):
             position=init_layers(keys[1], (width, width, width, 3)),
             posture=init_layers(keys[2], (width, width, width, 72), 0.1),
             inputs=no_normalisation(d),
-            outputs=no_normalisation(75),
+            outputs=no_normalisation(3 + 72),
             spread=0.02 * jnp.eye(3, dtype=jnp.float32),
         )
 

@@ -46,6 +46,7 @@ def first_pairs(pairs: np.ndarray) -> np.ndarray:
     """
     if not len(pairs):
         return np.zeros((0, 2), dtype=np.int64)
+    # Far above the noise of tracking, so that more of either says no more.
     enough = np.minimum(pairs[:, 2], np.radians(5.0))
     score = enough * np.minimum(pairs[:, 3], 100) ** 1.5
     chosen: list[np.ndarray] = []

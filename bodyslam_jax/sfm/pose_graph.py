@@ -20,6 +20,8 @@ from scipy.sparse.linalg import SuperLU, splu
 from bodyslam_jax.geometry import so3_numpy as so3
 
 _MAX_STEPS = 20
+_DOF = 7
+"""Degrees of freedom of a similarity, Sim(3): rotation, translation, scale."""
 _MIN_STEP = 1e-7
 """Largest component of a step at which the solve has converged."""
 _WIDTH = 7.0
@@ -95,7 +97,7 @@ class PoseGraph:
         self.information = np.linalg.inv(np.array([e.covariance for e in edges]))
         self.loop = np.array([e.loop for e in edges])
         own = np.array([[e.a, e.b] for e in edges])
-        self.rows = (7 * own[..., None] + np.arange(7)).reshape(-1, 14)
+        self.rows = (_DOF * own[..., None] + np.arange(_DOF)).reshape(-1, 14)
         """Index of each component of the two cameras of an edge."""
 
     def solve(self) -> Nodes:
@@ -115,8 +117,8 @@ class PoseGraph:
         factor, _ = self._factorised()
         found = np.zeros(len(edges))
         for k, (r, J) in enumerate(zip(*residuals(self.nodes, edges), strict=True)):
-            columns = np.zeros((7 * len(self.nodes.t), 7))
-            a, b = 7 * edges[k].a, 7 * edges[k].b
+            columns = np.zeros((_DOF * len(self.nodes.t), _DOF))
+            a, b = _DOF * edges[k].a, _DOF * edges[k].b
             columns[a : a + 7], columns[b : b + 7] = J[:, :7].T, J[:, 7:].T
             spread = columns[7:].T @ factor.solve(columns[7:])
             found[k] = r @ np.linalg.solve(spread + edges[k].covariance, r)
@@ -129,7 +131,7 @@ class PoseGraph:
         squared = np.einsum("ki,kij,kj->k", r, self.information, r)
         weight = np.where(self.loop, 1 / (1 + squared / _WIDTH), 1.0)
         pulled = np.swapaxes(J, 1, 2) @ (self.information * weight[:, None, None])
-        size = 7 * len(self.nodes.t)
+        size = _DOF * len(self.nodes.t)
         slope = np.zeros(size)
         np.add.at(slope, self.rows, (pulled @ r[..., None])[..., 0])
         blocks = pulled @ J

@@ -250,8 +250,8 @@ def _is_done(
     trial: Trial, known: Float[Array, ""], enough: Float[Array, ""]
 ) -> Bool[Array, ""]:
     """Returns True if a step would lower the cost by less than the tolerance."""
-    # Decreases below the rounding of the cost, or of residuals near 0, are invisible.
     eps = float(jnp.finfo(known.dtype).eps)
+    # Decreases below the rounding of the cost, or of residuals near 0, are invisible.
     floor = 8 * eps * known + eps**1.25
     small = trial.predicted <= jnp.maximum(enough, floor)
     undisturbed = trial.accepted & (trial.damping <= 1e-2)

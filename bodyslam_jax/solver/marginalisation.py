@@ -70,10 +70,9 @@ _INVARIANCE_TOLERANCE = {"float64": 1e-6, "float32": 1e-2}
 """Largest change of an invariant residual, in standard deviations, that rounding may
 cause where the map is moved as a whole."""
 _TEST_ROTATION_RAD = (0.3, -0.2, 0.4)
-"""Rotation of the map, rad, by which invariance is tested; any large one will do, and
-so will any translation and any change of scale."""
-_TEST_TRANSLATION = (0.7, -0.4, 0.5)
-_TEST_SCALE = 1.3
+"""Rotation of the map, rad, by which invariance is tested; any large one will do."""
+_TEST_TRANSLATION, _TEST_SCALE = (0.7, -0.4, 0.5), 1.3
+"""Translation and change of scale for the same test; any large ones will do."""
 
 
 class Remainder(NamedTuple):

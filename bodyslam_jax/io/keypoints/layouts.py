@@ -19,7 +19,7 @@ from bodyslam_jax.body.skeleton import BODY25
 
 HEAD_TOP, SPINE = 25, 26
 """Parts that BODY_25 does not have, after those that it has."""
-NUM_PARTS = 27
+NUM_PARTS = SPINE + 1
 _MIDDLE = {
     "nose": BODY25["nose"],
     **dict.fromkeys(("neck", "thorax", "midshoulder"), BODY25["neck"]),
