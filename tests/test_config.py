@@ -85,10 +85,6 @@ def test_settings_that_mean_something_are_let_in():
             "people_fit: `walking_knees` no longer exists: knees are as measured.",
         ),
         (
-            "people_fit: {lifter: held-out}",
-            "people_fit: `lifter` no longer exists: `people_fit.networks` chooses it",
-        ),
-        (
             "weights: {upright_sigma: 0.1}",
             "weights: `upright_sigma` no longer exists: it changed nothing",
         ),

@@ -318,7 +318,7 @@ def made_up(monkeypatch):
     real, computed, lifters = PLANS["table1"], [], []
 
     def plan(*given):
-        lifters.append(given[1].people_fit.networks)
+        lifters.append(given[1].people_fit.lifter)
         found = real(*given)
 
         def compute(job):
@@ -381,7 +381,9 @@ def test_tables_say_what_is_not_as_by_default(tmp_path, made_up, monkeypatch):
     named = lambda setting: setting and Path(setting)
     monkeypatch.setattr(reports, "body_model_file", named)
     plain = reports.about(Experiment(), Config())
-    assert plain == ("Simulated sequences, noise level `real`, networks `everybody`.")
+    assert plain == (
+        "Simulated sequences, noise level `real`, lifting network `everybody`."
+    )
     weights = dataclasses.replace(Config().weights, pixel_sigma=2.0)
     config = Config(weights=weights, motion_model="m.npz", body_model="b.npz")
     assert reports.about(Experiment(motion="walk.npz"), config) == (
@@ -396,7 +398,7 @@ def test_tables_say_what_is_not_as_by_default(tmp_path, made_up, monkeypatch):
         again = dataclasses.replace(on, seed=seed)
         experiments.run_experiment("table1", tmp_path, again)
         text = (tmp_path / "table1.md").read_text()
-        assert "noise level `real`, networks `held-out`." in text
+        assert "noise level `real`, lifting network `held-out`." in text
         assert f"Not as by default: seed {seed}; 300 frames each. Ours:" in text
 
 

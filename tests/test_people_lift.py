@@ -21,7 +21,7 @@ FPS = 30.0
 CAMERA = Intrinsics(np.array([900.0, 900.0, 640.0, 360.0]), 1280, 720)
 SIGMA = np.tile(lift.KEYPOINT_SIGMA, (60, 1))
 ANKLES = [7, 8]
-UNSEEN = PeopleFit(networks="held-out")
+UNSEEN = PeopleFit(lifter="held-out")
 """With the network that has not learnt from the people here."""
 
 
@@ -168,7 +168,7 @@ def test_a_guess_says_less_the_longer_its_errors_last(seen, body):
     decode = np.linalg.pinv(prior.basis)[:5]
 
     def away(seconds):
-        settings = PeopleFit(networks="held-out", lift_correlation=seconds)
+        settings = PeopleFit(lifter="held-out", lift_correlation=seconds)
         bodies = people.fit_bodies(seen, CAMERA, body, FPS, settings)
         angles = people.roots_from_bodies(bodies, body).body_pose[0, :, :21]
         latent = (angles.reshape(-1, 63) - np.asarray(prior.mean)) @ decode.T
@@ -205,9 +205,7 @@ def test_legs_of_who_walks_away_swing(walk, seen, body):
     share = swing(found) @ swing(joints) / (swing(joints) @ swing(joints))
     assert 0.9 < share < 1.1
     assert error(found) < 0.055
-    assert error(fit(PeopleFit(networks="held-out", lift_scale=0.0))) > 1.2 * error(
-        found
-    )
+    assert error(fit(PeopleFit(lifter="held-out", lift_scale=0.0))) > 1.2 * error(found)
 
 
 def test_in_single_precision(walk):
@@ -240,7 +238,7 @@ def test_knees_are_as_measured_and_not_as_those_of_most_people(body):
 @pytest.mark.parametrize("which", ["everybody", "held-out"])
 def test_the_setting_chooses_the_network_of_fits_and_of_the_filter(walk, body, which):
     _, _, points = walk
-    uv, settings = pixels(points, CAMERA.params), PeopleFit(networks=which)
+    uv, settings = pixels(points, CAMERA.params), PeopleFit(lifter=which)
     network = lift.load_lifter(lift.ASSETS[which])
     scene = fit.make_scene(CAMERA, body, FPS, settings)
     guess = fit.guess_postures(scene, uv, SIGMA, FPS, settings)
@@ -254,5 +252,5 @@ def test_guesses_of_no_scale_are_trusted_nowhere(walk, body):
     _, _, points = walk
     scene = fit.make_scene(CAMERA, body, FPS, UNSEEN)
     given = scene, pixels(points, CAMERA.params), SIGMA, FPS
-    guess = fit.guess_postures(*given, PeopleFit(networks="held-out", lift_scale=0.0))
+    guess = fit.guess_postures(*given, PeopleFit(lifter="held-out", lift_scale=0.0))
     assert np.isinf(guess.latent_sigma).all() and np.isinf(guess.turn_sigma).all()

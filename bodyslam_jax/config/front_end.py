@@ -55,10 +55,10 @@ class PeopleFit:
 
     max_gap: float = 0.3
     """Longest gap that is filled from the surrounding frames, s."""
-    networks: Literal["everybody", "held-out"] = "everybody"
-    """Networks that predict postures and contacts of feet: trained on everybody of the
-    motion data, or without the people whose motion simulated people have, so that
-    errors on simulated people are those on people who were not learnt from."""
+    lifter: Literal["everybody", "held-out"] = "everybody"
+    """Network that predicts postures: trained on everybody of the motion data, or
+    without the people whose motion simulated people have, so that errors on simulated
+    people are those on people who were not learnt from."""
     lift_scale: float = 1.0
     """Scale of the robust loss on postures that the lifting network predicts, in
     standard deviations of each component. 0: predictions are initial values only."""

@@ -12,7 +12,6 @@ from bodyslam_jax.config.errors import InputError
 
 S = TypeVar("S")
 REMOVED = {
-    "people_fit.lifter": "`people_fit.networks` chooses it, and the contact network",
     "people_fit.walking_knees": "knees are as measured",
     "weights.orientation_sigma": "it changed nothing",
     "weights.upright_sigma": "it changed nothing",

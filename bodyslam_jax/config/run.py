@@ -108,7 +108,7 @@ class Config(Known):
     def for_simulated_people(self) -> "Config":
         """Returns the settings with networks that have not been trained on the people
         whose motion simulated people have, for errors against their truth."""
-        fit = dataclasses.replace(self.people_fit, networks="held-out")
+        fit = dataclasses.replace(self.people_fit, lifter="held-out")
         return dataclasses.replace(self, people_fit=fit)
 
 

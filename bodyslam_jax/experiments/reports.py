@@ -188,15 +188,15 @@ def about(experiment: Experiment, config: Config) -> str:
     """Returns a sentence or two on simulation and settings of the rows of an
     experiment."""
     first = (
-        f"Simulated sequences, noise level `{experiment.noise}`, networks "
-        f"`{config.people_fit.networks}`."
+        f"Simulated sequences, noise level `{experiment.noise}`, lifting network "
+        f"`{config.people_fit.lifter}`."
     )
     return f"{first} {deviations(experiment, config)}".rstrip()
 
 
 def deviations(experiment: Experiment, config: Config) -> str:
     """Returns text on seed, length, motion, models and settings that differ from the
-    defaults, but for the choice of networks, which is the experiments'.
+    defaults, but for the lifting network, which experiments choose.
 
     Settings are compared with the nearest preset. A body model that is installed on
     this machine counts as named by the user. The text is empty if nothing differs.
@@ -214,7 +214,7 @@ def deviations(experiment: Experiment, config: Config) -> str:
     same = lambda preset: dataclasses.replace(
         preset,
         people_fit=dataclasses.replace(
-            preset.people_fit, networks=config.people_fit.networks
+            preset.people_fit, lifter=config.people_fit.lifter
         ),
     )
     against = {"default": same(Config()), "paper": same(Config.paper())}

@@ -43,8 +43,8 @@ _FIGURES = (
 )
 _OTHER = (
     " The first person does what `motion` says (a CMU trial, played forwards and "
-    "backwards), a second one walks. The posture prior, lifting and contact networks "
-    "have not learnt from the people of these trials."
+    "backwards), a second one walks. Neither the posture prior nor the lifting network "
+    "that ship learnt from the people of these trials."
 )
 _TRUTH_FIGURES = {name: f"{name}_of_truth" for name in FIGURES}
 """Keys of the figures that are computed for the truth as well."""

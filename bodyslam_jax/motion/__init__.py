@@ -11,7 +11,6 @@ from bodyslam_jax.motion.capture.clips import place as place
 from bodyslam_jax.motion.capture.clips import resample as resample
 from bodyslam_jax.motion.capture.clips import split as split
 from bodyslam_jax.motion.capture.readers import read_motion as read_motion
-from bodyslam_jax.motion.contact_network import CONTACT_FILES as CONTACT_FILES
 from bodyslam_jax.motion.contact_network import ContactModel as ContactModel
 from bodyslam_jax.motion.contact_network import load_contact_model as load_contact_model
 from bodyslam_jax.motion.contact_network import predict_contact as predict_contact

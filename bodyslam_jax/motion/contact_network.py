@@ -44,12 +44,7 @@ POINTS = ("left toe", "left heel", "right toe", "right heel")
 _INPUT_JOINTS = np.array([1, 2, 4, 5, 7, 8, 10, 11, 6, 12, 15, 20, 21])
 """Joints that are input to the network: legs, spine, head, wrists."""
 _FORMAT = "bodyslam-contact-1"
-_ASSETS = Path(__file__).parent / "assets"
-CONTACT_FILES = {
-    "everybody": _ASSETS / "contact.npz",
-    "held-out": _ASSETS / "contact_held_out.npz",
-}
-"""Files by the setting `PeopleFit.networks`."""
+_DEFAULT_FILE = Path(__file__).parent / "assets" / "contact.npz"
 
 
 class ContactModel(eqx.Module):
@@ -163,12 +158,11 @@ def save_contact_model(path: Path | str, model: ContactModel) -> None:
 
 
 def load_contact_model(path: Path | str | None = None) -> ContactModel:
-    """Reads a contact network (float32); by default that of the package which was
-    trained on everybody.
+    """Reads a contact network (float32); by default that of the package.
 
     **Raises:** `InputError` if the file is not a contact network.
     """
-    path = CONTACT_FILES["everybody"] if path is None else Path(path)
+    path = _DEFAULT_FILE if path is None else Path(path)
     if not path.exists():
         raise InputError(f"{path}: no such contact network.")
     archive = read_npz(path, "a contact network (.npz)")

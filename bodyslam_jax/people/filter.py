@@ -100,7 +100,7 @@ class PersonFilter:
     ) -> None:
         self.intrinsics, self.fps = intrinsics, fps
         self.scene = make_scene(intrinsics, body, fps, settings, definition)
-        self.lifter = load_lifter(ASSETS[settings.networks])
+        self.lifter = load_lifter(ASSETS[settings.lifter])
         self.recent: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
         self.belief: Belief | None = None
         self.time = 0.0

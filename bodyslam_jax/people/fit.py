@@ -221,7 +221,7 @@ def guess_postures(
     # Beyond the end the last frame is repeated, as the first one is before the start.
     last = lambda a: np.concatenate([a, np.repeat(a[-1:], length, axis=0)])
     numbers = (jnp.asarray(a, dtype) for a in (last(uv), last(sigma), fps))
-    network = load_lifter(ASSETS[settings.networks])
+    network = load_lifter(ASSETS[settings.lifter])
     lifted, usable = lift(network, scene.intrinsics, *numbers)
     trusted = usable & (settings.lift_scale > 0)
     lifted = lifted.widened(jnp.where(trusted, 1.0, jnp.inf).astype(dtype))

@@ -25,7 +25,7 @@ from bodyslam_jax.people.costs import KEYPOINT_SIGMA, Lifted
 ASSET = Path(__file__).parent / "assets" / "lifter.npz"
 HELD_OUT_ASSET = ASSET.with_name("lifter_held_out.npz")
 ASSETS = {"everybody": ASSET, "held-out": HELD_OUT_ASSET}
-"""Files by the setting `PeopleFit.networks`."""
+"""Files by the setting `PeopleFit.lifter`."""
 SPACING_S = 0.1
 """Time between the network's input frames, s."""
 NUM_SIDE_FRAMES = 5

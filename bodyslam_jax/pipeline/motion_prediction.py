@@ -34,7 +34,7 @@ def contact_predictor(
     without `weights.contact_sigma`, or if it was not trained on this kind of body."""
     if not config.weights.contact_sigma:
         return None
-    model = motion.load_contact_model(motion.CONTACT_FILES[config.people_fit.networks])
+    model = motion.load_contact_model()
     if model.body != body.kind:
         return None
     clock = motion.make_clock(sequence.timestamps, model.fps)

@@ -1,9 +1,9 @@
 """Simulates the ten named sequences: walk, camera, room, and measurements of them.
 
 `play` has people do something else than walk, as they were recorded. The ten recordings
-of `assets/other.npz`, one for each named sequence, are of people of whom the posture prior
-and the held-out lifting and contact networks have not learnt. World: y up, floor at
-y = 0, metres.
+of `assets/other.npz`, one for each named sequence, are of people of whom neither the
+posture prior nor the lifting network that ship learnt. World: y up, floor at y = 0,
+metres.
 """
 
 import dataclasses
