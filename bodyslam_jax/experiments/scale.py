@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from bodyslam_jax import graph, solver
+from bodyslam_jax.evaluation import Trajectories, evaluate_trajectories
 from bodyslam_jax.experiments.scenario import with_scale, without_map
-from bodyslam_jax.pipeline.case import Case
+from bodyslam_jax.pipeline.case import Case, trajectories
 
 PERTURBATIONS = (5.0, 2.0, 1.0, 0.5, 0.2, 0.1)
 """The paper's values of 1/s', which the estimated s should reach."""
@@ -36,6 +37,8 @@ class ScaleRecovery:
     """Estimated s, relative to the unit of the perturbed map."""
     history: Float[np.ndarray, "p n"]
     """Scale s after each iteration, including the start."""
+    h_ate: Float[np.ndarray, "p n"]
+    """H-ATE under SE(3) after each iteration, m."""
 
     @property
     def deviation(self) -> Float[np.ndarray, " p"]:
@@ -74,11 +77,16 @@ def scale_recovery(
     state, history = _recover(schedule)(
         jnp.asarray(perturbations),
         *true_size,
+        case.truth,
+        case.body,
+        jnp.asarray(case.bodies.present),
+        jnp.asarray(case.cameras.registered),
     )
     return ScaleRecovery(
         perturbation=np.array(perturbations),
         scale=np.asarray(state.scale),
         history=np.asarray(history["scale"]),
+        h_ate=np.asarray(history["h_ate"]),
     )
 
 
@@ -86,9 +94,20 @@ def scale_recovery(
 def _recover(schedule):
     """Returns one function per schedule, which compiles once for cases of one size."""
     one = functools.partial(_recover_one, schedule=schedule)
-    return solver.vmap_over_devices(one, (0, None, None))
+    return solver.vmap_over_devices(one, (0, *(None,) * 6))
 
 
-def _recover_one(perturbation, problem, state, *, schedule):
+def _recover_one(
+    perturbation, problem, state, truth, body, present, registered, *, schedule
+):
     start = graph.rescaled(problem, state, 1 / perturbation)
-    return solver.trace(*start, lambda y: {"scale": y.scale}, schedule=schedule)
+    observe = lambda y: {
+        "scale": y.scale,
+        "h_ate": _h_ate(y, truth, body, present, registered),
+    }
+    return solver.trace(*start, observe, schedule=schedule)
+
+
+def _h_ate(state, truth: Trajectories, body, present, registered):
+    estimate = trajectories(state, body, present, registered, truth.fps)
+    return evaluate_trajectories(estimate, truth)["h_ate_se3"]
