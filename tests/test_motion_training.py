@@ -284,7 +284,8 @@ def test_a_trained_network_is_trained_further(body, clips, trained):
     assert history[0, 0] < first[0, 0]
     for name in ("inputs", "posture_inputs", "posture_outputs", "unit"):
         kept, found = (getattr(m.network, name) for m in (before, after))
-        assert eqx.tree_equal(kept, found)
+        # A running mean of what stays the same rounds.
+        assert eqx.tree_equal(kept, found, rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -85,10 +85,7 @@ def table(
             first: np.ndarray | None = None
             for name, model in models.items():
                 found = judge_contact(model, body, chosen, drift)
-                each = [
-                    wrong(judge_contact(model, body, [clip], drift, seed=i))
-                    for i, clip in enumerate(chosen)
-                ]
+                each = [wrong(judge_contact(model, body, [c], drift)) for c in chosen]
                 each = np.array(each)
                 first = each if first is None else first
                 away = each - first
