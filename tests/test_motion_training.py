@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +29,9 @@ from bodyslam_jax.motion import (
     split,
     train,
 )
+from bodyslam_jax.motion.capture.clips import FPS, place, resample
 from bodyslam_jax.motion.paper_network import PaperNetwork
+from bodyslam_jax.motion.training.evaluation import calibrated, widened
 from bodyslam_jax.motion.training.sampling import corpus, draw
 from bodyslam_jax.motion.training.train import loss
 
@@ -271,6 +274,28 @@ def test_the_output_path_is_checked_before_training(
 def test_training_learns(trained):
     _, history = trained
     assert history[-1, 0] < history[0, 0]
+
+
+@pytest.mark.slow
+def test_a_trained_network_is_trained_further(body, clips, trained):
+    """From where it stopped, with the normalisation that it has."""
+    before, first = trained
+    after, history = train(clips, body, NOISY, network=before.network)
+    assert history[0, 0] < first[0, 0]
+    for name in ("inputs", "posture_inputs", "posture_outputs", "unit"):
+        kept, found = (getattr(m.network, name) for m in (before, after))
+        # A running mean of what stays the same rounds.
+        assert eqx.tree_equal(kept, found, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_size_of_the_covariance_is_told(body, validation, trained):
+    """So that another network may have the one that was found for this."""
+    model, _ = trained
+    factor = json.loads(model.about)["covariance_factor"]
+    trials = place(body, resample([c for c in validation if c.phase == 0], FPS))
+    again = calibrated(widened(model, 1 / factor), body, trials)
+    assert json.loads(again.about)["covariance_factor"] == pytest.approx(factor, 1e-3)
 
 
 class StepForward(MotionNetwork):

@@ -169,6 +169,13 @@ def test_fit_of_keypoints_that_are_all_in_one_place(body):
     assert np.isfinite(found.poses).all() and np.isfinite(found.trans).all()
 
 
+def test_elbows_bend_one_way():
+    prior = posture_prior.load_posture_prior(FPS)
+    left, right = 3 * 17 + 1, 3 * 18 + 1  # y of the elbows in θ of joints 1 to 21
+    assert prior.lower[left] < -2 and prior.upper[left] < 0.2
+    assert prior.upper[right] > 2 and prior.lower[right] > -0.2
+
+
 def test_the_prior_at_another_rate_is_the_same_process():
     """Correlation over 1/30 s: one step at 30 fps, two steps at 60."""
     at = {

@@ -1,11 +1,12 @@
 """Learns the posture prior of `bodyslam_jax.people` from CMU motion capture.
 
-    python tools/make_posture_prior.py DATA_FOLDER OUT.npz
+    python tools/make_posture_prior.py DATA_FOLDER OUT.npz [PRIOR.npz]
 
 `DATA_FOLDER` holds `cmu_locomotion.npz`, `cmu_other.npz` and `cmu_more.npz`: SMPL joint
 rotations at 30 fps with the arrays `poses` (n, 24, 3), `seq_name`, `seq_start`,
 `seq_length`, `seq_subject`, `seq_split` and `seq_phase`. What is learnt and why is in
 `bodyslam_jax/people/posture_prior.py`; what was held out is in the model card there.
+With PRIOR.npz all but the limits are taken from it: lifters speak in its components.
 """
 
 import sys
@@ -61,7 +62,14 @@ def sequences(data: dict[str, np.ndarray], keep: np.ndarray) -> list[np.ndarray]
     return found
 
 
-def main(folder: Path, out: Path) -> None:
+def limits(frames: np.ndarray) -> dict[str, np.ndarray]:
+    """Without weights: extremes are the point of them."""
+    lower, upper = np.quantile(frames, (LIMIT_QUANTILE, 1 - LIMIT_QUANTILE), axis=0)
+    lower, upper = lower - LIMIT_MARGIN, upper + LIMIT_MARGIN
+    return {"lower": lower.astype(np.float32), "upper": upper.astype(np.float32)}
+
+
+def main(folder: Path, out: Path, prior: Path | None = None) -> None:
     walking, other = [], []
     for name, data, usable in archives(folder):
         keep = usable & ~np.isin(data["seq_subject"], HELD_OUT)
@@ -71,6 +79,9 @@ def main(folder: Path, out: Path) -> None:
     shares = (LOCOMOTION_SHARE, 1 - LOCOMOTION_SHARE)
     stacked = [np.concatenate(group) for group in groups]
     frames = np.concatenate(stacked)
+    if prior is not None:
+        np.savez_compressed(out, **dict(np.load(prior)) | limits(frames))
+        return
     weight = np.concatenate(
         [np.full(len(s), share / len(s)) for s, share in zip(stacked, shares)]
     )
@@ -100,16 +111,12 @@ def main(folder: Path, out: Path) -> None:
     a1 = first * (1 - second) / (1 - first**2)
     a2 = (second - first**2) / (1 - first**2)
 
-    # Limits without weights: extremes are the point of them.
-    lower = np.quantile(frames, LIMIT_QUANTILE, axis=0) - LIMIT_MARGIN
-    upper = np.quantile(frames, 1 - LIMIT_QUANTILE, axis=0) + LIMIT_MARGIN
     np.savez_compressed(
         out,
         mean=mean.astype(np.float32),
         basis=basis.astype(np.float32),
         autoregression=np.stack([a1, a2], 1),
-        lower=lower.astype(np.float32),
-        upper=upper.astype(np.float32),
+        **limits(frames),
         frames=len(frames),
         held_out_subjects=np.array(HELD_OUT),
         source="CMU Graphics Lab Motion Capture Database, mocap.cs.cmu.edu",
@@ -123,4 +130,4 @@ def main(folder: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(*map(Path, sys.argv[1:]))

@@ -8,6 +8,8 @@ Validation during training takes the same errors (`validated`) and selects the e
 whose weights are kept (`kept`).
 """
 
+import dataclasses
+import json
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -345,7 +347,8 @@ def calibrated(
     model: MotionModel, body: BodyModel, trials: Sequence[Trial]
 ) -> MotionModel:
     """Scales the predicted covariance so that the mean squared whitened error per axis
-    (NEES / 3) is 1 over `trials` at all `DRIFTS_DEG`.
+    (NEES / 3) is 1 over `trials` at all `DRIFTS_DEG`. The factor on standard deviations
+    is the entry `covariance_factor` of `about`.
 
     The paper's network predicts no covariance; that of its errors is used as a
     constant.
@@ -362,10 +365,16 @@ def calibrated(
         return model
     covariance = np.concatenate([r.covariance[r.valid] for r in runs]).astype(float)
     nees = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(-1) / 3
+    factor = float(np.sqrt(nees.mean()))
+    about = json.loads(model.about) | {"covariance_factor": factor}
+    return dataclasses.replace(widened(model, factor), about=json.dumps(about))
+
+
+def widened(model: MotionModel, factor: float) -> MotionModel:
+    """Returns the model with its standard deviations multiplied by a factor."""
     if isinstance(model.network, FunctionNetwork):
-        spread = model.network.spread * float(np.sqrt(nees.mean()))
+        spread = model.network.spread * factor
         return eqx.tree_at(lambda m: m.network.spread, model, spread)
-    factor = 0.5 * np.log(nees.mean())
     bias = lambda m: [layers[-1].bias for layers in m.network.spreads]
-    shift = jnp.asarray([factor] * 3 + [0.0] * 3, jnp.float32)
+    shift = jnp.asarray([np.log(factor)] * 3 + [0.0] * 3, jnp.float32)
     return eqx.tree_at(bias, model, [b + shift for b in bias(model)])

@@ -138,9 +138,10 @@ def trainable(network):
     return eqx.tree_at(lambda n: (n.unit, n.gain), mask, (False, False))
 
 
-def _measure(network: MotionNetwork, batches: Sequence[Batch]) -> MotionNetwork:
-    """Sets the normalisation from batches of training data; a custom network has
-    none."""
+def _measure(
+    network: PaperNetwork | MetricNetwork, batches: Sequence[Batch]
+) -> MotionNetwork:
+    """Sets the normalisation of an untrained network from batches of training data."""
     rows = lambda f: np.concatenate(
         [np.asarray(f(b)).reshape(b.weight.size, -1) for b in batches]
     )
@@ -149,8 +150,6 @@ def _measure(network: MotionNetwork, batches: Sequence[Batch]) -> MotionNetwork:
         outputs = normalisation(np.concatenate([move, rows(lambda b: b.pose)], -1))
         inputs = normalisation(rows(lambda b: network.features(b.window)))
         return eqx.tree_at(lambda n: (n.inputs, n.outputs), network, (inputs, outputs))
-    if not isinstance(network, MetricNetwork):
-        return network
     unit = np.sqrt((rows(lambda b: b.move) ** 2).sum(-1).mean())
     return eqx.tree_at(
         lambda n: (n.inputs, n.posture_inputs, n.posture_outputs, n.unit),
@@ -164,7 +163,9 @@ def _measure(network: MotionNetwork, batches: Sequence[Batch]) -> MotionNetwork:
     )
 
 
-def initial_network(key: PRNGKeyArray, settings: MotionTraining) -> MotionNetwork:
+def initial_network(
+    key: PRNGKeyArray, settings: MotionTraining
+) -> PaperNetwork | MetricNetwork:
     """Returns an untrained network of the kind in `settings`."""
     if settings.network == "paper":
         return PaperNetwork.init(key, settings.past, settings.width[0])
@@ -275,7 +276,8 @@ def train(
     file that every epoch rewrites, from which the same call resumes after an
     interruption; remove it when the weights are saved. `report(epoch, epochs,
     measures)` is called after each epoch. The same seed gives the same weights on the
-    same machine. `network` is a custom network, which replaces that of `settings`.
+    same machine. `network` replaces an untrained one as in `settings`: a custom
+    network, or a trained one that is trained further, whose normalisation is kept.
 
     **Raises:** `InputError` if no clip is long enough, if a checkpoint belongs to
     other settings or data, or if training diverges.
@@ -286,9 +288,9 @@ def train(
     steps = -(-data.num_windows // (settings.segments * settings.steps))
     key = jax.random.key(settings.seed)
     if network is None:
-        network = initial_network(jax.random.fold_in(key, 0), settings)
-    keys = jax.random.split(jax.random.fold_in(key, 2), _NORMALISATION_BATCHES)
-    network = _measure(network, [draw(k, data, body, settings) for k in keys])
+        untrained = initial_network(jax.random.fold_in(key, 0), settings)
+        keys = jax.random.split(jax.random.fold_in(key, 2), _NORMALISATION_BATCHES)
+        network = _measure(untrained, [draw(k, data, body, settings) for k in keys])
     progress = start(network, settings)
     mark = fingerprint(settings, data, body)
     if checkpoint is not None and checkpoint.exists():
