@@ -84,8 +84,9 @@ def _below_a_comment(tree: ast.AST, lines: list[str]) -> set[int]:
     """Lines of simple statements that a line of comment precedes."""
     found = set()
     for node in ast.walk(tree):
-        is_simple = isinstance(node, ast.stmt) and not hasattr(node, "body")
-        if is_simple and lines[node.lineno - 2].lstrip().startswith("#"):
+        if not isinstance(node, ast.stmt) or hasattr(node, "body"):
+            continue
+        if lines[node.lineno - 2].lstrip().startswith("#"):
             found |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
     return found
 
