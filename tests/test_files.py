@@ -54,6 +54,7 @@ OWN_FILES = {
     "view/scene_data.py": "ships with the package, and a run's page",
     "motion/weights.py": "text in memory",
     "motion/contact_network.py": "text in memory",
+    "motion/training/evaluation.py": "text in memory",
     "batch/slurm_engine.py": "values that its own workers write",
     "batch/program_cache.py": "programs that its own workers write",
     # Run and batch folders: files that this package wrote and may find damaged.
