@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import bodyslam_jax as bs
 from bodyslam_jax import simulation
 from bodyslam_jax.body.skeleton import HIPS
-from bodyslam_jax.config import Simulation
+from bodyslam_jax.config import Config, Simulation
 from bodyslam_jax.diagnostics import figures, moments, standing_height
 from bodyslam_jax.diagnostics.checks import (
     Reason,
@@ -162,6 +163,19 @@ def test_walkers_who_lean_further_than_their_feet_reach_are_doubted(walk):
     low[:, HIPS] -= [0.0, 0.4, 0.0]
     assert np.isnan(figures.lean_of_walkers(low[None], everywhere[:1]))
     assert np.isnan(figures.lean_of_walkers(both, ~everywhere))
+
+
+@pytest.mark.slow
+def test_a_run_is_doubted_for_walkers_who_lean_against_a_wrong_gravity():
+    made = simulation.simulate(
+        Simulation(sequence="M1", family="follow", length=60, noise="low")
+    )
+    turn = Rotation.from_euler("z", 14, degrees=True).as_matrix()
+    down = turn @ made.T_WC[0, :3, :3].T @ [0.0, -1.0, 0.0]
+    config = Config(gravity=tuple(map(float, down)))
+    result = bs.run(simulation.as_sequence(made), config)
+    assert result.summary["status"] == "doubtful"
+    assert "lean_of_walkers" in [r["name"] for r in result.summary["reasons"]]
 
 
 def test_people_who_float_or_sink_are_doubted(walk):
